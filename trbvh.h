@@ -235,3 +235,2277 @@ TRBVH_API trbvh_result trbvh_occluded_n (const trbvh *bvh, const trbvh_ray *rays
 
 #endif /* !TRBVH_OPENCL_C */
 #endif /* TRBVH_H */
+
+// ===================================================================================================================
+//   IMPLEMENTATION, in the paper's order: references, Morton codes, hierarchy, treelets, collapse; then the queries
+// ===================================================================================================================
+#if (defined(TRBVH_IMPLEMENTATION) || defined(TRBVH_OPENCL_C)) && !defined(TRBVH_IMPLEMENTED)
+#define TRBVH_IMPLEMENTED
+
+// >>config ---- what differs between the languages and compilers ----------------------------------------------------
+/* Fused multiply-adds round once where C rounds twice: they change costs, and with them trees (style: the same bits
+ * everywhere). Compilers fuse by default where the machine can, so this is switched off for our own code, whatever
+ * the flags. Not to be repaired from here: -ffast-math, and clang's -ffp-contract=fast. */
+#if defined(TRBVH_OPENCL_C)
+  #pragma OPENCL FP_CONTRACT OFF
+#elif defined(__clang__)
+  #pragma STDC FP_CONTRACT OFF
+#elif defined(__GNUC__)
+  #pragma GCC push_options
+  #pragma GCC optimize("fp-contract=off")
+#elif defined(_MSC_VER)
+  #pragma fp_contract(off)
+#endif
+
+#ifdef TRBVH_OPENCL_C
+  #define TRB_CORE   static inline __attribute__((unused))
+  #define TRB_GLOBAL __global
+  typedef ulong trb_u64;
+  #define trb_bits(x)  as_uint(x)
+  #define trb_float(x) as_float(x)
+#else
+  #include <float.h>
+  #include <stdio.h>            /* snprintf, for messages */
+  #include <stdlib.h>
+  #include <string.h>
+  #if defined(__GNUC__)
+    #define TRB_CORE static inline __attribute__((always_inline))
+  #elif defined(_MSC_VER)
+    #define TRB_CORE static __forceinline
+  #else
+    #define TRB_CORE static inline
+  #endif
+  #define TRB_GLOBAL
+  typedef uint64_t trb_u64;
+  TRB_CORE trbvh_u32 trb_bits(float x) { trbvh_u32 u; memcpy(&u, &x, 4); return u; }
+  TRB_CORE float trb_float(trbvh_u32 u) { float x; memcpy(&x, &u, 4); return x; }
+#endif
+#if defined(__cplusplus) || defined(_MSC_VER)
+  #define TRB_RESTRICT __restrict
+#else
+  #define TRB_RESTRICT restrict
+#endif
+
+// >>core ---- valid C99, C++ and OpenCL C 1.2: what decides a tree, and what a ray meets ----------------------------
+/* The OpenCL backend compiles this very text, so that both make the same tree bit for bit. Hence its rules: float,
+ * int, uint; no libm, no division and no square root in what decides topology, min and max by comparison, ties
+ * broken by structure. Big arrays are TRB_GLOBAL, small ones local; no recursion, no function pointers. */
+
+#define TRB_MIN(a, b) ((a) < (b) ? (a) : (b))     /* the second where one is NaN */
+#define TRB_MAX(a, b) ((a) > (b) ? (a) : (b))
+
+TRB_CORE float trb_abs(float x) { return x < 0 ? -x : x; }
+TRB_CORE int   trb_finite(float x) { return (trb_bits(x) & 0x7F800000u) != 0x7F800000u; }
+
+TRB_CORE trbvh_u32 trb_log2(trbvh_u32 x) {        /* floor; x > 0 */
+  trbvh_u32 n = 0;
+  if (x >> 16) { n += 16; x >>= 16; }
+  if (x >> 8)  { n += 8;  x >>= 8; }
+  if (x >> 4)  { n += 4;  x >>= 4; }
+  if (x >> 2)  { n += 2;  x >>= 2; }
+  return n + (x >> 1);
+}
+
+/* 1 / x for normal x > 0, within 2 units in the last place: Newton's steps from a linear guess on the bits. */
+TRB_CORE float trb_reciprocal(float x) {
+  float r = trb_float(0x7EF311C3u - trb_bits(x));
+  r = r * (2.0f - x * r);
+  r = r * (2.0f - x * r);
+  r = r * (2.0f - x * r);
+  return r;
+}
+
+/* Cube root of x >= 0, within a few units in the last place: x r^2 with r = x^(-1/3) by Newton's steps. */
+TRB_CORE float trb_cube_root(float x) {
+  float r;
+  int i;
+  if (!(x > 1e-30f)) return 0;
+  r = trb_float(0x54A21D2Au - trb_bits(x) / 3);
+  for (i = 0; i < 4; i++) r = r * (4.0f - x * r * r * r) * 0.333333343f;
+  return x * r * r;
+}
+
+// ---- Boxes and costs ----
+/* A build node is a trbvh_node: box, `first` the left child's index (a reference's primitive, where the count is 1),
+ * and in `count` a word that holds the number of references and, for subtrees small enough to become a leaf, the
+ * cost of the better of both forms (paper, equation 2), in units of Ci, as a float short of its five lowest bits:
+ *
+ *     larger than max_leaf:  0 | count, 31 bits
+ *     small:                 1 | leaf is better | count - 1, 4 bits | cost, 26 bits
+ *
+ * Larger subtrees need no cost: it adds the same constant to every topology above them. */
+#define TRB_MAX_LEAF 16u
+#define TRB_SMALL    0x80000000u
+#define TRB_LEAF     0x40000000u
+
+/* What the surface area heuristic needs: Ct / Ci and the largest leaf. */
+typedef struct trb_costs { float ratio; trbvh_u32 max_leaf; } trb_costs;
+
+TRB_CORE trbvh_u32 trb_count(trbvh_u32 word)   { return word & TRB_SMALL ? ((word >> 26) & 15u) + 1 : word; }
+TRB_CORE float     trb_cost(trbvh_u32 word)    { return word & TRB_SMALL ? trb_float((word & 0x3FFFFFFu) << 5) : 0; }
+TRB_CORE int       trb_is_leaf(trbvh_u32 word) { return (word & (TRB_SMALL | TRB_LEAF)) == (TRB_SMALL | TRB_LEAF); }
+
+/* Half the surface area. Where it overflows, FLT_MAX: trees stay valid there, no more. */
+TRB_CORE float trb_area(trbvh_node n) {
+  float x = n.max[0] - n.min[0], y = n.max[1] - n.min[1], z = n.max[2] - n.min[2];
+  float area = x * y + z * (x + y);
+  return TRB_MIN(area, FLT_MAX);
+}
+
+TRB_CORE trbvh_u32 trb_small(trbvh_u32 count, float cost, int leaf) {
+  return TRB_SMALL | (leaf ? TRB_LEAF : 0) | (count - 1) << 26 | (trb_bits(cost) & 0x7FFFFFFFu) >> 5;
+}
+
+/* The node of a single reference. */
+TRB_CORE trbvh_node trb_reference(trbvh_node box, trb_costs costs) {
+  box.count = trb_small(1, costs.ratio * trb_area(box), 1);
+  return box;
+}
+
+/* The parent of l and r, which stand at first and first + 1: the paper's equation 2. */
+TRB_CORE trbvh_node trb_parent(trbvh_node l, trbvh_node r, trbvh_u32 first, trb_costs costs) {
+  trbvh_node n;
+  trbvh_u32 count = trb_count(l.count) + trb_count(r.count);
+  n.min[0] = TRB_MIN(l.min[0], r.min[0]); n.max[0] = TRB_MAX(l.max[0], r.max[0]);
+  n.min[1] = TRB_MIN(l.min[1], r.min[1]); n.max[1] = TRB_MAX(l.max[1], r.max[1]);
+  n.min[2] = TRB_MIN(l.min[2], r.min[2]); n.max[2] = TRB_MAX(l.max[2], r.max[2]);
+  n.first = first;
+  n.count = count;
+  if (count <= costs.max_leaf) {
+    float area = trb_area(n), split = area + (trb_cost(l.count) + trb_cost(r.count));
+    float leaf = costs.ratio * area * (float)count;
+    n.count = trb_small(count, TRB_MIN(leaf, split), leaf <= split);
+  }
+  return n;
+}
+
+// ---- Morton codes ----
+/* A cubic grid of 2^21 cells a side over the scene: cubic, because cells as flat as the scene make flat nodes. */
+#define TRB_GRID_BITS 21
+typedef struct trb_grid { float origin[3]; float cells_per_unit, units_per_cell; } trb_grid;
+
+TRB_CORE trbvh_u32 trb_cell(float x, float origin, float cells_per_unit) {
+  const float last = 2097151.0f;
+  float cell = (x - origin) * cells_per_unit;
+  cell = TRB_MIN(cell, last);                        /* NaN, where extents overflow, too */
+  return (trbvh_u32)TRB_MAX(cell, 0.0f);
+}
+
+TRB_CORE trb_u64 trb_spread(trbvh_u32 cell) {        /* 21 bits to every third */
+  trb_u64 x = cell;                                  /* ............................fedcba */
+  x = (x | x << 32) & 0x001F00000000FFFFu;
+  x = (x | x << 16) & 0x001F0000FF0000FFu;
+  x = (x | x << 8)  & 0x100F00F00F00F00Fu;
+  x = (x | x << 4)  & 0x10C30C30C30C30C3u;
+  return (x | x << 2) & 0x1249249249249249u;         /* ............f..e..d..c..b..a */
+}
+
+/* 63 bits: the Morton code of a box's centre. */
+TRB_CORE trb_u64 trb_morton(trbvh_node box, trb_grid grid) {
+  trbvh_u32 x = trb_cell(0.5f * box.min[0] + 0.5f * box.max[0], grid.origin[0], grid.cells_per_unit);
+  trbvh_u32 y = trb_cell(0.5f * box.min[1] + 0.5f * box.max[1], grid.origin[1], grid.cells_per_unit);
+  trbvh_u32 z = trb_cell(0.5f * box.min[2] + 0.5f * box.max[2], grid.origin[2], grid.cells_per_unit);
+  return trb_spread(x) << 2 | trb_spread(y) << 1 | trb_spread(z);
+}
+
+// ---- Treelets: the dynamic program (paper, section 3.2) ----
+/* The best binary tree over seven treelet leaves, for all 127 subsets of them, smaller ones first. With a(s) the half
+ * area of the box around subset s and n(s) its references, in units of Ci and less the leaves' own costs u:
+ *
+ *     c(s) = min( a(s) + min over partitions {p, s - p} of c(p) + c(s - p),   Ct/Ci a(s) n(s) - u(s) )
+ *
+ * The second term, a leaf, where n(s) <= max_leaf. Single leaves cost nothing, so sums with them fall away.
+ *
+ * It is straight-line code, unrolled by the macros below, with one value of TRB_LANE a variable. In C a TRB_LANE is a
+ * float, and the caller loops over TRB_LANES treelets, which every compiler turns into vector code of any width; in
+ * OpenCL C it may be a vector itself. The table c goes out, for trb_partition to find the topology that made it. */
+#define TRB_TREELET 7
+#ifndef TRB_LANE
+  #define TRB_LANE  float
+  #define TRB_LANES 8                    /* neighbours in memory are TRB_LANES apart */
+#endif
+#define TRB_LEAF_VALUES 8                /* of a treelet leaf: min[3], max[3], references, cost */
+#define TRB_SUBSETS     128              /* one bit a treelet leaf */
+
+#define TRB_SINGLE(s)    (((s) & ((s) - 1)) == 0)
+#define TRB_BOTH(p, q)   (TRB_SINGLE(p) ? c[q] : TRB_SINGLE(q) ? c[p] : c[p] + c[q])
+/* Partitions: TRB_Qk tries all ways to deal k more leaves to p and q, both non-empty; TRB_Pk those of p alone. */
+#define TRB_Q0(p, q)              { TRB_LANE sum = TRB_BOTH(p, q); best = TRB_MIN(sum, best); }
+#define TRB_Q1(p, q, a)           TRB_Q0((p) | (a), q)          TRB_Q0(p, (q) | (a))
+#define TRB_Q2(p, q, a, b)        TRB_Q1((p) | (a), q, b)       TRB_Q1(p, (q) | (a), b)
+#define TRB_Q3(p, q, a, b, d)     TRB_Q2((p) | (a), q, b, d)    TRB_Q2(p, (q) | (a), b, d)
+#define TRB_Q4(p, q, a, b, d, e)  TRB_Q3((p) | (a), q, b, d, e) TRB_Q3(p, (q) | (a), b, d, e)
+#define TRB_Q5(p, q, a, b, d, e, f) TRB_Q4((p) | (a), q, b, d, e, f) TRB_Q4(p, (q) | (a), b, d, e, f)
+#define TRB_P1(p, a)                TRB_Q0(p, a)
+#define TRB_P2(p, a, b)             TRB_Q1(p, a, b)             TRB_P1((p) | (a), b)
+#define TRB_P3(p, a, b, d)          TRB_Q2(p, a, b, d)          TRB_P2((p) | (a), b, d)
+#define TRB_P4(p, a, b, d, e)       TRB_Q3(p, a, b, d, e)       TRB_P3((p) | (a), b, d, e)
+#define TRB_P5(p, a, b, d, e, f)    TRB_Q4(p, a, b, d, e, f)    TRB_P4((p) | (a), b, d, e, f)
+#define TRB_P6(p, a, b, d, e, f, g) TRB_Q5(p, a, b, d, e, f, g) TRB_P5((p) | (a), b, d, e, f, g)
+/* Boxes: those of the 7 subsets of leaves 0..2 and the 15 of leaves 3..6; any other is the union of two of them. */
+#define TRB_SIDE(s, k, pick) ((s) < 8 ? low[(s) & 7][k] : ((s) & 7) == 0 ? high[(s) >> 3][k] \
+                              : pick(low[(s) & 7][k], high[(s) >> 3][k]))
+#define TRB_WIDTH(s, k)      (TRB_SIDE(s, (k) + 3, TRB_MAX) - TRB_SIDE(s, k, TRB_MIN))
+#define TRB_UNION(t, s, p, q) \
+  t[s][0] = TRB_MIN(t[p][0], t[q][0]); t[s][3] = TRB_MAX(t[p][3], t[q][3]); \
+  t[s][1] = TRB_MIN(t[p][1], t[q][1]); t[s][4] = TRB_MAX(t[p][4], t[q][4]); \
+  t[s][2] = TRB_MIN(t[p][2], t[q][2]); t[s][5] = TRB_MAX(t[p][5], t[q][5]);
+#define TRB_VALUE(i, k) leaves[((i) * TRB_LEAF_VALUES + (k)) * TRB_LANES]
+#define TRB_ENTER(t, s, i) \
+  t[s][0] = TRB_VALUE(i, 0); t[s][1] = TRB_VALUE(i, 1); t[s][2] = TRB_VALUE(i, 2); \
+  t[s][3] = TRB_VALUE(i, 3); t[s][4] = TRB_VALUE(i, 4); t[s][5] = TRB_VALUE(i, 5); \
+  n[1 << (i)] = TRB_VALUE(i, 6); u[1 << (i)] = TRB_VALUE(i, 7); c[1 << (i)] = 0;
+/* A larger subset than max_leaf is no leaf: (n - limit) FLT_MAX, hugely negative otherwise, then stands above all. */
+#define TRB_SUBSET(s, partitions) { \
+  TRB_LANE x = TRB_WIDTH(s, 0), y = TRB_WIDTH(s, 1), z = TRB_WIDTH(s, 2); \
+  TRB_LANE area = x * y + z * (x + y), best = FLT_MAX, split, leaf, over; \
+  partitions \
+  n[s] = n[(s) & ((s) - 1)] + n[(s) & -(s)]; \
+  u[s] = u[(s) & ((s) - 1)] + u[(s) & -(s)]; \
+  split = area + best; \
+  leaf = ratio * area * n[s] - u[s]; \
+  over = (n[s] - limit) * FLT_MAX; \
+  leaf = TRB_MAX(leaf, over); \
+  c[s] = TRB_MIN(leaf, split); \
+  table[(s) * TRB_LANES] = c[s]; }
+#define TRB_S2(i, j) TRB_SUBSET((1 << i | 1 << j), TRB_P1(1 << i, 1 << j))
+#define TRB_S3(i, j, k) TRB_SUBSET((1 << i | 1 << j | 1 << k), TRB_P2(1 << i, 1 << j, 1 << k))
+#define TRB_S4(i, j, k, l) \
+  TRB_SUBSET((1 << i | 1 << j | 1 << k | 1 << l), TRB_P3(1 << i, 1 << j, 1 << k, 1 << l))
+#define TRB_S5(i, j, k, l, m) \
+  TRB_SUBSET((1 << i | 1 << j | 1 << k | 1 << l | 1 << m), TRB_P4(1 << i, 1 << j, 1 << k, 1 << l, 1 << m))
+#define TRB_S6(without) TRB_SUBSET((127 ^ 1 << without), TRB_P5(1 << TRB_SKIP(0, without), \
+  1 << TRB_SKIP(1, without), 1 << TRB_SKIP(2, without), 1 << TRB_SKIP(3, without), 1 << TRB_SKIP(4, without), \
+  1 << TRB_SKIP(5, without)))
+#define TRB_SKIP(i, without) ((i) + ((i) >= (without)))
+
+TRB_CORE void trb_treelet_costs(const TRB_LANE *TRB_RESTRICT leaves, TRB_LANE *TRB_RESTRICT table, trb_costs costs) {
+  const float ratio = costs.ratio, limit = (float)costs.max_leaf + 0.5f;
+  TRB_LANE low[8][6], high[16][6], c[TRB_SUBSETS], n[TRB_SUBSETS], u[TRB_SUBSETS];
+  TRB_ENTER(low, 1, 0) TRB_ENTER(low, 2, 1) TRB_ENTER(low, 4, 2)
+  TRB_ENTER(high, 1, 3) TRB_ENTER(high, 2, 4) TRB_ENTER(high, 4, 5) TRB_ENTER(high, 8, 6)
+  TRB_UNION(low, 3, 1, 2) TRB_UNION(low, 5, 1, 4) TRB_UNION(low, 6, 2, 4) TRB_UNION(low, 7, 3, 4)
+  TRB_UNION(high, 3, 1, 2)   TRB_UNION(high, 5, 1, 4)   TRB_UNION(high, 6, 2, 4)   TRB_UNION(high, 7, 3, 4)
+  TRB_UNION(high, 9, 1, 8)   TRB_UNION(high, 10, 2, 8)  TRB_UNION(high, 11, 3, 8)  TRB_UNION(high, 12, 4, 8)
+  TRB_UNION(high, 13, 5, 8)  TRB_UNION(high, 14, 6, 8)  TRB_UNION(high, 15, 7, 8)
+  TRB_S2(0, 1) TRB_S2(0, 2) TRB_S2(1, 2) TRB_S2(0, 3) TRB_S2(1, 3) TRB_S2(2, 3) TRB_S2(0, 4)
+  TRB_S2(1, 4) TRB_S2(2, 4) TRB_S2(3, 4) TRB_S2(0, 5) TRB_S2(1, 5) TRB_S2(2, 5) TRB_S2(3, 5)
+  TRB_S2(4, 5) TRB_S2(0, 6) TRB_S2(1, 6) TRB_S2(2, 6) TRB_S2(3, 6) TRB_S2(4, 6) TRB_S2(5, 6)
+  TRB_S3(0, 1, 2) TRB_S3(0, 1, 3) TRB_S3(0, 2, 3) TRB_S3(1, 2, 3) TRB_S3(0, 1, 4) TRB_S3(0, 2, 4) TRB_S3(1, 2, 4)
+  TRB_S3(0, 3, 4) TRB_S3(1, 3, 4) TRB_S3(2, 3, 4) TRB_S3(0, 1, 5) TRB_S3(0, 2, 5) TRB_S3(1, 2, 5) TRB_S3(0, 3, 5)
+  TRB_S3(1, 3, 5) TRB_S3(2, 3, 5) TRB_S3(0, 4, 5) TRB_S3(1, 4, 5) TRB_S3(2, 4, 5) TRB_S3(3, 4, 5) TRB_S3(0, 1, 6)
+  TRB_S3(0, 2, 6) TRB_S3(1, 2, 6) TRB_S3(0, 3, 6) TRB_S3(1, 3, 6) TRB_S3(2, 3, 6) TRB_S3(0, 4, 6) TRB_S3(1, 4, 6)
+  TRB_S3(2, 4, 6) TRB_S3(3, 4, 6) TRB_S3(0, 5, 6) TRB_S3(1, 5, 6) TRB_S3(2, 5, 6) TRB_S3(3, 5, 6) TRB_S3(4, 5, 6)
+  TRB_S4(0, 1, 2, 3) TRB_S4(0, 1, 2, 4) TRB_S4(0, 1, 3, 4) TRB_S4(0, 2, 3, 4) TRB_S4(1, 2, 3, 4)
+  TRB_S4(0, 1, 2, 5) TRB_S4(0, 1, 3, 5) TRB_S4(0, 2, 3, 5) TRB_S4(1, 2, 3, 5) TRB_S4(0, 1, 4, 5)
+  TRB_S4(0, 2, 4, 5) TRB_S4(1, 2, 4, 5) TRB_S4(0, 3, 4, 5) TRB_S4(1, 3, 4, 5) TRB_S4(2, 3, 4, 5)
+  TRB_S4(0, 1, 2, 6) TRB_S4(0, 1, 3, 6) TRB_S4(0, 2, 3, 6) TRB_S4(1, 2, 3, 6) TRB_S4(0, 1, 4, 6)
+  TRB_S4(0, 2, 4, 6) TRB_S4(1, 2, 4, 6) TRB_S4(0, 3, 4, 6) TRB_S4(1, 3, 4, 6) TRB_S4(2, 3, 4, 6)
+  TRB_S4(0, 1, 5, 6) TRB_S4(0, 2, 5, 6) TRB_S4(1, 2, 5, 6) TRB_S4(0, 3, 5, 6) TRB_S4(1, 3, 5, 6)
+  TRB_S4(2, 3, 5, 6) TRB_S4(0, 4, 5, 6) TRB_S4(1, 4, 5, 6) TRB_S4(2, 4, 5, 6) TRB_S4(3, 4, 5, 6)
+  TRB_S5(0, 1, 2, 3, 4) TRB_S5(0, 1, 2, 3, 5) TRB_S5(0, 1, 2, 4, 5) TRB_S5(0, 1, 3, 4, 5) TRB_S5(0, 2, 3, 4, 5)
+  TRB_S5(1, 2, 3, 4, 5) TRB_S5(0, 1, 2, 3, 6) TRB_S5(0, 1, 2, 4, 6) TRB_S5(0, 1, 3, 4, 6) TRB_S5(0, 2, 3, 4, 6)
+  TRB_S5(1, 2, 3, 4, 6) TRB_S5(0, 1, 2, 5, 6) TRB_S5(0, 1, 3, 5, 6) TRB_S5(0, 2, 3, 5, 6) TRB_S5(1, 2, 3, 5, 6)
+  TRB_S5(0, 1, 4, 5, 6) TRB_S5(0, 2, 4, 5, 6) TRB_S5(1, 2, 4, 5, 6) TRB_S5(0, 3, 4, 5, 6) TRB_S5(1, 3, 4, 5, 6)
+  TRB_S5(2, 3, 4, 5, 6)
+  TRB_S6(6) TRB_S6(5) TRB_S6(4) TRB_S6(3) TRB_S6(2) TRB_S6(1) TRB_S6(0)
+  TRB_SUBSET(127, TRB_P6(1, 2, 4, 8, 16, 32, 64))
+}
+
+/* The part of subset s that holds its lowest leaf in the cheapest partition; among equals the first, counting up. */
+TRB_CORE trbvh_u32 trb_partition(const TRB_LANE *table, trbvh_u32 s) {
+  trbvh_u32 rest = s & (s - 1), q = 0, best_q = 0;
+  float best = 0;
+  do {                                               /* q: all non-empty subsets of the rest, counting up */
+    float sum;
+    trbvh_u32 p;
+    q = (q - rest) & rest;
+    p = s ^ q;
+    sum = (TRB_SINGLE(p) ? 0 : table[p * TRB_LANES]) + (TRB_SINGLE(q) ? 0 : table[q * TRB_LANES]);
+    if (best_q == 0 || sum < best) { best = sum; best_q = q; }
+  } while (q != rest);
+  return s ^ best_q;
+}
+
+/* Which treelet leaf to expand next: the one with the largest key. Half area first (less the three lowest bits of its
+ * float), then the lower slot; 0 for a single reference, which cannot be expanded. */
+TRB_CORE trbvh_u32 trb_expand_key(trbvh_node n, trbvh_u32 slot) {
+  return trb_count(n.count) == 1 ? 0 : (trb_bits(trb_area(n)) & ~7u) | (TRB_TREELET - slot);
+}
+
+/* Not to be rewritten for rounding errors: a new topology must save more than 2^-18 of the old one's cost. */
+TRB_CORE int trb_improves(float cost, float old_cost) { return cost < old_cost - old_cost * 3.8147e-6f; }
+
+// ---- Triangle splitting (paper, section 4) ----
+/* How much a triangle wants to be split: cube root of 2^i (A - A_ideal), with A its box's surface area, A_ideal what
+ * is left of it after infinitely many splits, and i the level of the most important spatial median plane that cuts
+ * the box (-1 for the scene's middle, -2 for the quarters, ...). */
+typedef struct trb_plane { int axis, level; float position; } trb_plane;
+
+TRB_CORE trb_plane trb_median_plane(trbvh_node box, trb_grid grid) {
+  trb_plane plane;
+  int k;
+  plane.axis = 0; plane.level = -TRB_GRID_BITS - 1; plane.position = 0;
+  for (k = 0; k < 3; k++) {
+    trbvh_u32 low = trb_cell(box.min[k], grid.origin[k], grid.cells_per_unit);
+    trbvh_u32 high = trb_cell(box.max[k], grid.origin[k], grid.cells_per_unit);
+    if (low != high) {
+      int bit = (int)trb_log2(low ^ high);
+      if (bit - TRB_GRID_BITS > plane.level) {       /* of equally important planes the first, as in the Morton code */
+        plane.level = bit - TRB_GRID_BITS;
+        plane.axis = k;
+        plane.position = grid.origin[k] + (float)(high >> bit << bit) * grid.units_per_cell;
+      }
+    }
+  }
+  return plane;
+}
+
+TRB_CORE float trb_split_priority(const float v[3][3], trbvh_node box, trb_grid grid) {
+  float ax = v[1][0] - v[0][0], ay = v[1][1] - v[0][1], az = v[1][2] - v[0][2];
+  float bx = v[2][0] - v[0][0], by = v[2][1] - v[0][1], bz = v[2][2] - v[0][2];
+  float ideal = trb_abs(ay * bz - az * by) + trb_abs(az * bx - ax * bz) + trb_abs(ax * by - ay * bx);
+  float empty = 2.0f * trb_area(box) - ideal;        /* below 0 by rounding, or NaN where areas overflow: no split */
+  float weight = trb_float((trbvh_u32)(127 + trb_median_plane(box, grid).level) << 23);
+  return empty > 0 && empty < FLT_MAX ? trb_cube_root(weight * empty) : 0;
+}
+
+/* Where to cut box in two: at the median plane, or the middle of its longest side where that plane only touches it.
+ * 0 where there is nothing between the faces. */
+TRB_CORE int trb_choose_plane(trbvh_node box, trb_grid grid, trb_plane *plane) {
+  float x = box.max[0] - box.min[0], y = box.max[1] - box.min[1], z = box.max[2] - box.min[2];
+  int k;
+  *plane = trb_median_plane(box, grid);
+  k = plane->axis;
+  if (plane->level > -TRB_GRID_BITS - 1 && plane->position > box.min[k] && plane->position < box.max[k]) return 1;
+  k = x >= y ? (x >= z ? 0 : 2) : (y >= z ? 1 : 2);
+  plane->axis = k;
+  plane->position = 0.5f * box.min[k] + 0.5f * box.max[k];
+  return plane->position > box.min[k] && plane->position < box.max[k];
+}
+
+/* The share of `splits` for the half whose longest side is `left`, rounded. */
+TRB_CORE trbvh_u32 trb_share(trbvh_u32 splits, float left, float right) {
+  float both = left + right;
+  float share = both > 1e-30f && both < 1e30f ? left * trb_reciprocal(both) : 0.5f;
+  trbvh_u32 n = (trbvh_u32)((float)splits * share + 0.5f);
+  return TRB_MIN(n, splits);
+}
+
+TRB_CORE float trb_longest_side(trbvh_node box) {
+  float x = box.max[0] - box.min[0], y = box.max[1] - box.min[1], z = box.max[2] - box.min[2], xy = TRB_MAX(x, y);
+  return TRB_MAX(xy, z);
+}
+
+/* Cuts the polygon of n corners at position on axis k and keeps the side above (sign 1) or below (-1). */
+#define TRB_POLYGON 10                               /* corners of a triangle cut six times: 9 */
+TRB_CORE int trb_cut(float polygon[TRB_POLYGON][3], int n, int k, float position, float sign) {
+  float kept[TRB_POLYGON][3];
+  int i, j, count = 0;
+  for (i = 0; i < n; i++) {
+    int next = i + 1 < n ? i + 1 : 0;
+    float a = (polygon[i][k] - position) * sign, b = (polygon[next][k] - position) * sign;
+    if (a >= 0 && count < TRB_POLYGON) {
+      for (j = 0; j < 3; j++) kept[count][j] = polygon[i][j];
+      count++;
+    }
+    if (((a > 0 && b < 0) || (a < 0 && b > 0)) && count < TRB_POLYGON) {
+      float t = trb_abs(a) * trb_reciprocal(trb_abs(a) + trb_abs(b));
+      for (j = 0; j < 3; j++) kept[count][j] = polygon[i][j] + (polygon[next][j] - polygon[i][j]) * t;
+      kept[count][k] = position;
+      count++;
+    }
+  }
+  for (i = 0; i < count; i++)
+    for (j = 0; j < 3; j++) polygon[i][j] = kept[i][j];
+  return count;
+}
+
+/* Shrinks the box to the part of the triangle inside it; 0, and the box as it was, where there is none.
+ * Corners that lie on a cut are rounded. So that no ray slips between two fragments, the triangle is cut at a box
+ * wider by 2^-20 of the coordinates, what is left is padded by 2^-21, and only then cut off at the box's own faces,
+ * which it shares with its neighbour: together, the fragments then cover the triangle. */
+TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {
+  float polygon[TRB_POLYGON][3];
+  trbvh_node bounds = *box;
+  int i, j, k, n = 3;
+  for (i = 0; i < 3; i++)
+    for (j = 0; j < 3; j++) polygon[i][j] = v[i][j];
+  for (k = 0; k < 3; k++) {
+    float a = trb_abs(v[0][k]), b = trb_abs(v[1][k]), c = trb_abs(v[2][k]), ab = TRB_MAX(a, b);
+    float pad = TRB_MAX(ab, c) * 9.5367432e-7f;
+    n = trb_cut(polygon, n, k, box->min[k] - pad, 1);
+    n = trb_cut(polygon, n, k, box->max[k] + pad, -1);
+  }
+  if (n == 0) return 0;
+  for (k = 0; k < 3; k++) {
+    float a = trb_abs(v[0][k]), b = trb_abs(v[1][k]), c = trb_abs(v[2][k]), ab = TRB_MAX(a, b);
+    float pad = TRB_MAX(ab, c) * 4.7683716e-7f, low = polygon[0][k], high = polygon[0][k];
+    for (i = 1; i < n; i++) {
+      low = TRB_MIN(low, polygon[i][k]);
+      high = TRB_MAX(high, polygon[i][k]);
+    }
+    low -= pad;
+    high += pad;
+    bounds.min[k] = TRB_MAX(low, box->min[k]);
+    bounds.max[k] = TRB_MIN(high, box->max[k]);
+    if (!(bounds.min[k] <= bounds.max[k])) return 0;
+  }
+  *box = bounds;
+  return 1;
+}
+
+// ---- Ray tests ----
+/* A ray made ready for many tests. For boxes (Kay and Kajiya): which corner is nearer on each axis, and 1 / dir, with
+ * infinities for zeros. For triangles (Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection", JCGT 2013): the
+ * axis along which the ray is longest, now called z, and the shear that makes it the z axis. */
+typedef struct trb_ray {
+  float origin[3], inverse[3], tmin, tmax;
+  float shear[3];
+  int   near_corner[3], far_corner[3], axis[3];
+} trb_ray;
+
+/* 0 for a ray that can hit nothing: one with a NaN or infinity, or without a direction. */
+TRB_CORE int trb_prepare_ray(trb_ray *r, const TRB_GLOBAL trbvh_ray *ray) {
+  float x = trb_abs(ray->dir[0]), y = trb_abs(ray->dir[1]), z = trb_abs(ray->dir[2]);
+  int k, finite = 1;
+  for (k = 0; k < 3; k++) {
+    int negative = (int)(trb_bits(ray->dir[k]) >> 31);
+    finite &= trb_finite(ray->origin[k]) & trb_finite(ray->dir[k]);
+    r->origin[k] = ray->origin[k];
+    r->inverse[k] = ray->dir[k] != 0 ? 1.0f / ray->dir[k] : trb_float(negative ? 0xFF800000u : 0x7F800000u);
+    r->near_corner[k] = negative ? k + 4 : k;
+    r->far_corner[k] = negative ? k : k + 4;
+  }
+  r->axis[2] = x >= y ? (x >= z ? 0 : 2) : (y >= z ? 1 : 2);
+  r->axis[0] = r->axis[2] == 2 ? 0 : r->axis[2] + 1;
+  r->axis[1] = r->axis[0] == 2 ? 0 : r->axis[0] + 1;
+  r->shear[2] = r->inverse[r->axis[2]];
+  r->shear[0] = ray->dir[r->axis[0]] * r->shear[2];
+  r->shear[1] = ray->dir[r->axis[1]] * r->shear[2];
+  r->tmin = TRB_MAX(ray->tmin, 0.0f);
+  r->tmax = ray->tmax == 0 ? FLT_MAX : TRB_MIN(ray->tmax, FLT_MAX);
+  return finite && x + y + z > 0 && ray->tmin == ray->tmin && ray->tmax == ray->tmax && r->tmin < r->tmax;
+}
+
+/* Where the ray enters the box, if it meets it between tmin and limit; else a negative number.
+ * Conservative: a distance is off by 2^-22 at most, so the far side is put 2^-20 further (Ize, "Robust BVH Ray
+ * Traversal", JCGT 2013). A ray inside a face's plane gives 0 * infinity, NaN, which neither comparison takes: such a
+ * ray is inside that slab. Boxes are read as eight floats: min at 0, max at 4. */
+#define TRB_FAR_SLACK 1.00000095f
+TRB_CORE float trb_hit_box(const TRB_GLOBAL float *box, const trb_ray *r, float limit) {
+  float near0 = (box[r->near_corner[0]] - r->origin[0]) * r->inverse[0];
+  float near1 = (box[r->near_corner[1]] - r->origin[1]) * r->inverse[1];
+  float near2 = (box[r->near_corner[2]] - r->origin[2]) * r->inverse[2];
+  float far0 = (box[r->far_corner[0]] - r->origin[0]) * r->inverse[0];
+  float far1 = (box[r->far_corner[1]] - r->origin[1]) * r->inverse[1];
+  float far2 = (box[r->far_corner[2]] - r->origin[2]) * r->inverse[2];
+  float enter = r->tmin, leave = limit;
+  enter = TRB_MAX(near0, enter); leave = TRB_MIN(far0, leave);
+  enter = TRB_MAX(near1, enter); leave = TRB_MIN(far1, leave);
+  enter = TRB_MAX(near2, enter); leave = TRB_MIN(far2, leave);
+  return enter <= leave * TRB_FAR_SLACK ? enter : -1.0f;
+}
+
+/* Does the ray hit the triangle at tmin < t <= tmax? t, u, v go to hit, the rest of which stays.
+ * u, v, w are edge functions of the corners as the ray sees them, twice the areas opposite of them. The corners come
+ * from v0 and two rounded edges, so that neighbours may see a shared edge a rounding error apart: a miss by less than
+ * `tolerance`, an upper bound of these errors (8 units of rounding), is a hit, and no ray slips through. A triangle
+ * seen so much from the side that its area is below that is left to its neighbours. */
+TRB_CORE int trb_hit_triangle(const TRB_GLOBAL trbvh_triangle *t, const trb_ray *r, float tmax, trbvh_hit *hit) {
+  const int kx = r->axis[0], ky = r->axis[1], kz = r->axis[2];
+  float az = t->v0[kz] - r->origin[kz], bz = az + t->e1[kz], cz = az + t->e2[kz];
+  float ax0 = t->v0[kx] - r->origin[kx], ay0 = t->v0[ky] - r->origin[ky];
+  float ax = ax0 - r->shear[0] * az, bx = ax0 + t->e1[kx] - r->shear[0] * bz, cx = ax0 + t->e2[kx] - r->shear[0] * cz;
+  float ay = ay0 - r->shear[1] * az, by = ay0 + t->e1[ky] - r->shear[1] * bz, cy = ay0 + t->e2[ky] - r->shear[1] * cz;
+  float u = cx * by - cy * bx, v = ax * cy - ay * cx, w = bx * ay - by * ax;
+  float area = u + v + w, inverse, distance;
+  float extent = trb_abs(ax) + trb_abs(bx) + trb_abs(cx) + trb_abs(ay) + trb_abs(by) + trb_abs(cy);
+  float depth = trb_abs(az) + trb_abs(bz) + trb_abs(cz);
+  float tolerance = (extent + depth) * extent * 4.7683716e-7f;
+  if (area < 0) { u = -u; v = -v; w = -w; area = -area; }
+  if (!(u >= -tolerance && v >= -tolerance && w >= -tolerance && area > 0.25f * tolerance)) return 0;
+  u = TRB_MAX(u, 0.0f);
+  v = TRB_MAX(v, 0.0f);
+  w = TRB_MAX(w, 0.0f);
+  inverse = 1.0f / (u + v + w);
+  u *= inverse;
+  v *= inverse;
+  w *= inverse;
+  distance = (u * az + v * bz + w * cz) * r->shear[2];
+  if (!(distance > r->tmin && distance <= tmax)) return 0;
+  hit->t = distance;
+  hit->u = v;                                        /* the weight of v1 */
+  hit->v = w;                                        /* the weight of v2 */
+  return 1;
+}
+
+/* Closest hit, or with `any` the first one found: front to back, the farther child waiting on the stack with the
+ * distance of its box. One entry a level, so TRBVH_MAX_DEPTH of them are enough. Among equal distances the lower
+ * primitive wins: the answer is the same for every tree over these triangles. hit: t is the limit on a miss. */
+TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbvh_triangle *triangles,
+                       const trb_ray *r, int any, trbvh_hit *hit) {
+  trbvh_u32 stack_node[TRBVH_MAX_DEPTH], height = 0, node = 0, i;
+  float     stack_near[TRBVH_MAX_DEPTH];
+  hit->t = r->tmax;
+  hit->u = hit->v = 0;
+  hit->prim = hit->instance = TRBVH_NONE;
+  if (trb_hit_box((const TRB_GLOBAL float *)&nodes[0], r, r->tmax) < 0) return 0;
+  for (;;) {
+    const trbvh_u32 first = nodes[node].first, count = nodes[node].count;
+    if (count == 0) {
+      float left = trb_hit_box((const TRB_GLOBAL float *)&nodes[first], r, hit->t);
+      float right = trb_hit_box((const TRB_GLOBAL float *)&nodes[first + 1], r, hit->t);
+      if (left >= 0 && right >= 0) {
+        trbvh_u32 swap = right < left;
+        stack_node[height] = first + 1 - swap;
+        stack_near[height++] = swap ? left : right;
+        node = first + swap;
+        continue;
+      }
+      if (left >= 0 || right >= 0) {
+        node = left >= 0 ? first : first + 1;
+        continue;
+      }
+    }
+    for (i = first; i < first + count; i++) {
+      trbvh_hit found;
+      if (!trb_hit_triangle(&triangles[i], r, hit->t, &found)) continue;
+      if (any) return 1;
+      if (found.t < hit->t || triangles[i].prim < hit->prim) {
+        hit->t = found.t;
+        hit->u = found.u;
+        hit->v = found.v;
+        hit->prim = triangles[i].prim;
+      }
+    }
+    do {
+      if (height == 0) return hit->prim != TRBVH_NONE;
+      node = stack_node[--height];
+    } while (stack_near[height] > hit->t * TRB_FAR_SLACK);
+  }
+}
+
+#ifndef TRBVH_OPENCL_C
+
+TRBVH_API unsigned trbvh_version(void) { return TRBVH_VERSION; }
+
+TRBVH_API const char *trbvh_result_text(trbvh_result result) {
+  switch (result) {
+    #define TRBVH_X(name, text) case TRBVH_##name: return text;
+    TRBVH_RESULTS(TRBVH_X)
+    #undef TRBVH_X
+    case TRBVH_RESULT_COUNT: break;
+  }
+  return "not a trbvh_result";
+}
+
+// >>memory ----------------------------------------------------------------------------------------------------------
+#ifndef TRBVH_MALLOC
+  #define TRBVH_MALLOC(size) malloc(size)
+  #define TRBVH_FREE(pointer) free(pointer)
+#endif
+#ifndef TRBVH_ASSERT
+  #define TRBVH_ASSERT(x) ((void)0)
+#endif
+#if defined(__GNUC__)
+  #define TRB_PREFETCH(address) __builtin_prefetch(address)
+#else
+  #define TRB_PREFETCH(address) ((void)0)
+#endif
+#define TRB_LINE 64u                     /* bytes in a cache line: what the block's parts are aligned to */
+
+static void *trb_alloc(const trbvh_allocator *a, size_t size) {
+  return a->alloc ? a->alloc(a->user, size) : TRBVH_MALLOC(size);
+}
+
+static void trb_free(const trbvh_allocator *a, void *p, size_t size) {
+  if (!p) return;
+  if (a->free) a->free(a->user, p, size);
+  else TRBVH_FREE(p);
+}
+
+static char *trb_align(void *p) {
+  return (char *)p + ((TRB_LINE - ((uintptr_t)p & (TRB_LINE - 1))) & (TRB_LINE - 1));
+}
+
+TRBVH_API void trbvh_free(trbvh *bvh) {
+  if (!bvh) return;
+  trb_free(&bvh->allocator, bvh->block, bvh->block_size);
+  memset(bvh, 0, sizeof *bvh);
+}
+
+// >>jobs ---- parallel_for: the engine's, the library's own threads, or a loop --------------------------------------
+/* Every stage is cut into jobs of a fixed size whose results do not depend on their order, so the tree does not
+ * depend on who runs them. */
+#ifdef TRBVH_THREADS
+  #if defined(_WIN32)
+    #ifndef WIN32_LEAN_AND_MEAN
+      #define WIN32_LEAN_AND_MEAN
+    #endif
+    #include <windows.h>
+    typedef HANDLE trb_thread;
+    typedef CRITICAL_SECTION trb_mutex;
+    typedef CONDITION_VARIABLE trb_signal;
+    #define TRB_THREAD_MAIN              DWORD WINAPI
+    #define trb_mutex_init(m)            InitializeCriticalSection(m)
+    #define trb_mutex_free(m)            DeleteCriticalSection(m)
+    #define trb_lock(m)                  EnterCriticalSection(m)
+    #define trb_unlock(m)                LeaveCriticalSection(m)
+    #define trb_signal_init(s)           InitializeConditionVariable(s)
+    #define trb_signal_free(s)           ((void)(s))
+    #define trb_wait(s, m)               SleepConditionVariableCS(s, m, INFINITE)
+    #define trb_wake_all(s)              WakeAllConditionVariable(s)
+    #define trb_thread_start(t, f, p)    ((*(t) = CreateThread(NULL, 0, f, p, 0, NULL)) != NULL)
+    #define trb_thread_join(t)           (WaitForSingleObject(t, INFINITE), CloseHandle(t))
+  #else
+    #include <pthread.h>
+    typedef pthread_t trb_thread;
+    typedef pthread_mutex_t trb_mutex;
+    typedef pthread_cond_t trb_signal;
+    #define TRB_THREAD_MAIN              void *
+    #define trb_mutex_init(m)            pthread_mutex_init(m, NULL)
+    #define trb_mutex_free(m)            pthread_mutex_destroy(m)
+    #define trb_lock(m)                  pthread_mutex_lock(m)
+    #define trb_unlock(m)                pthread_mutex_unlock(m)
+    #define trb_signal_init(s)           pthread_cond_init(s, NULL)
+    #define trb_signal_free(s)           pthread_cond_destroy(s)
+    #define trb_wait(s, m)               pthread_cond_wait(s, m)
+    #define trb_wake_all(s)              pthread_cond_broadcast(s)
+    #define trb_thread_start(t, f, p)    (pthread_create(t, NULL, f, p) == 0)
+    #define trb_thread_join(t)           pthread_join(t, NULL)
+  #endif
+  #define TRB_THREADS_MAX 64u
+
+/* Threads that live as long as one call of the library. Jobs are coarse, so that a mutex hands them out. */
+typedef struct trb_pool {
+  trb_mutex  mutex;
+  trb_signal work, idle;                 /* there are jobs, or it is time to quit; all jobs are done */
+  trbvh_job *job;
+  void      *context;
+  uint32_t   next, count, running, threads;
+  int        quit;
+  trb_thread thread[TRB_THREADS_MAX];
+} trb_pool;
+
+static void trb_pool_work(trb_pool *pool) {          /* entered and left with the mutex held */
+  while (pool->next < pool->count) {
+    trbvh_job *job = pool->job;
+    void *context = pool->context;
+    uint32_t index = pool->next++;
+    pool->running++;
+    trb_unlock(&pool->mutex);
+    job(context, index);
+    trb_lock(&pool->mutex);
+    pool->running--;
+  }
+  if (pool->running == 0) trb_wake_all(&pool->idle);
+}
+
+static TRB_THREAD_MAIN trb_pool_thread(void *p) {
+  trb_pool *pool = (trb_pool *)p;
+  trb_lock(&pool->mutex);
+  while (!pool->quit) {
+    trb_pool_work(pool);
+    if (!pool->quit) trb_wait(&pool->work, &pool->mutex);
+  }
+  trb_unlock(&pool->mutex);
+  return 0;
+}
+
+static void trb_pool_run(trb_pool *pool, uint32_t count, trbvh_job *job, void *context) {
+  trb_lock(&pool->mutex);
+  pool->job = job;
+  pool->context = context;
+  pool->next = 0;
+  pool->count = count;
+  trb_wake_all(&pool->work);
+  trb_pool_work(pool);
+  while (pool->running) trb_wait(&pool->idle, &pool->mutex);
+  trb_unlock(&pool->mutex);
+}
+
+static void trb_pool_start(trb_pool *pool, uint32_t width) {   /* fewer threads than asked for are fine */
+  memset(pool, 0, sizeof *pool);
+  trb_mutex_init(&pool->mutex);
+  trb_signal_init(&pool->work);
+  trb_signal_init(&pool->idle);
+  while (pool->threads + 1 < TRB_MIN(width, TRB_THREADS_MAX) &&
+         trb_thread_start(&pool->thread[pool->threads], trb_pool_thread, pool))
+    pool->threads++;
+}
+
+static void trb_pool_stop(trb_pool *pool) {
+  uint32_t i;
+  trb_lock(&pool->mutex);
+  pool->quit = 1;
+  trb_wake_all(&pool->work);
+  trb_unlock(&pool->mutex);
+  for (i = 0; i < pool->threads; i++) trb_thread_join(pool->thread[i]);
+  trb_signal_free(&pool->work);
+  trb_signal_free(&pool->idle);
+  trb_mutex_free(&pool->mutex);
+}
+#endif
+
+/* Runs jobs, reports progress between them, and stops when the callback says so. */
+typedef struct trb_runner {
+  const trbvh_options *options;
+  float share, done;                     /* of the whole call: the present stage's, what all before it came to */
+  int   cancelled;
+#ifdef TRBVH_THREADS
+  trb_pool pool;
+#endif
+} trb_runner;
+
+static void trb_runner_start(trb_runner *runner, const trbvh_options *options, int threads) {
+  runner->options = options;
+  runner->share = runner->done = 0;
+  runner->cancelled = 0;
+#ifdef TRBVH_THREADS
+  trb_pool_start(&runner->pool, threads && !options->jobs.parallel_for ? options->jobs.width : 1);
+#else
+  (void)threads;
+#endif
+}
+
+static void trb_runner_stop(trb_runner *runner) {
+#ifdef TRBVH_THREADS
+  trb_pool_stop(&runner->pool);
+#else
+  (void)runner;
+#endif
+}
+
+static int trb_progress(trb_runner *runner, float part) {
+  const trbvh_options *o = runner->options;
+  float done = runner->done + runner->share * part;
+  if (o->progress && !runner->cancelled && o->progress(o->progress_user, TRB_MIN(done, 1.0f))) runner->cancelled = 1;
+  return runner->cancelled;
+}
+
+/* The next stage takes `share` of the call's time. */
+static int trb_stage(trb_runner *runner, float share) {
+  runner->done += runner->share;
+  runner->share = share;
+  return trb_progress(runner, 0);
+}
+
+typedef struct trb_wave { trbvh_job *job; void *context; uint32_t first; } trb_wave;
+static void trb_wave_job(void *context, uint32_t index) {
+  trb_wave *wave = (trb_wave *)context;
+  wave->job(wave->context, wave->first + index);
+}
+
+/* Non-zero where the call was cancelled, with some jobs not run. */
+static int trb_run(trb_runner *runner, uint32_t count, trbvh_job *job, void *context) {
+  const trbvh_jobs *jobs = &runner->options->jobs;
+  uint32_t width = jobs->width > 1 ? TRB_MIN(jobs->width, 4096u) : 1, n;
+  trb_wave wave;
+  wave.job = job;
+  wave.context = context;
+  for (wave.first = 0; wave.first < count && !runner->cancelled; wave.first += n) {
+    n = TRB_MIN(count - wave.first, runner->options->progress ? 16 * width : count);
+    if (jobs->parallel_for && n > 1) jobs->parallel_for(jobs->user, n, trb_wave_job, &wave);
+#ifdef TRBVH_THREADS
+    else if (runner->pool.threads && n > 1) trb_pool_run(&runner->pool, n, trb_wave_job, &wave);
+#endif
+    else {
+      uint32_t i;
+      for (i = 0; i < n; i++) trb_wave_job(&wave, i);
+    }
+    if (wave.first + n < count) trb_progress(runner, (float)(wave.first + n) / (float)count);
+  }
+  return runner->cancelled;
+}
+
+#include <time.h>
+#if !defined(TIME_UTC) && !defined(_WIN32)
+  #include <sys/time.h>
+#endif
+static double trb_ms(void) {
+#if defined(TIME_UTC)
+  struct timespec t;
+  timespec_get(&t, TIME_UTC);
+  return 1e3 * (double)t.tv_sec + 1e-6 * (double)t.tv_nsec;
+#elif defined(_WIN32)
+  return 1e3 * (double)clock() / CLOCKS_PER_SEC;     /* wall-clock time there */
+#else
+  struct timeval t;
+  gettimeofday(&t, NULL);
+  return 1e3 * (double)t.tv_sec + 1e-3 * (double)t.tv_usec;
+#endif
+}
+
+// >>input ---- arguments made explicit and checked, primitives read whatever their form -----------------------------
+#define TRB_REFS_MAX      0x7FFFFFFFu    /* node indices are twice that */
+#define TRB_PACKED_MAX_BITS 24
+#ifndef TRB_PACKED_REFS                  /* up to here, sort keys hold both code and index. Lower in a test */
+  #define TRB_PACKED_REFS (1u << TRB_PACKED_MAX_BITS)
+#endif
+#define TRB_CODE_BITS     44u            /* of the Morton code in such a key, at most: four digits of the sort */
+#define TRB_DIGIT_BITS    11u
+#define TRB_DIGITS        (1u << TRB_DIGIT_BITS)
+#define TRB_SORT_BLOCK    65536u         /* keys a job counts and scatters */
+#define TRB_BLOCK         16384u         /* primitives, references or leaves a job works on: their nodes fit a cache */
+#define TRB_OPEN_MAX      200u           /* subtrees of a block that its neighbours complete: 2 (63 + 32) + 1 at most */
+#define TRB_SPLIT_STACK   64u            /* fragments of one triangle that wait to be split */
+#define TRB_AHEAD         16u            /* how far ahead random reads are asked for */
+#define TRB_NODE_BYTES    sizeof(trbvh_node)
+
+/* What one block of primitives came to. */
+typedef struct trb_block {
+  trbvh_node bounds;                     /* of the references; min > max where there are none */
+  trbvh_node centres;                    /* of their centres */
+  uint32_t   start, count;               /* its references */
+  uint32_t   split_start;                /* and after splitting */
+  uint32_t   skipped, bad, bad_vertex;   /* primitives; the first with an index out of range (TRBVH_NONE: none), and it */
+  float      priority;                   /* the largest */
+  trb_u64    splits;                     /* a sum, for the search for the scale */
+} trb_block;
+
+/* A subtree whose parent reaches beyond its block: what splits it from its right neighbour, and the place its parent
+ * may put the two at. */
+typedef struct trb_open { trbvh_node node; trb_u64 split; uint32_t pair; } trb_open;
+typedef struct trb_range { uint32_t open_count; trb_open open[TRB_OPEN_MAX]; } trb_range;
+
+/* Subtrees that one job restructures, and the references in them. */
+typedef struct trb_group { uint32_t first_ref, refs, seeds; } trb_group;
+
+/* A subtree that one job collapses: what is known of it, what it came to, and its place in the result. */
+typedef struct trb_task {
+  uint32_t node, depth, first_ref;
+  uint32_t leaves, prims, max_depth;
+  double   sah;
+  uint32_t dst, pair, first_prim;
+} trb_task;
+
+typedef struct trb_build {
+  const trbvh_geometry *geometry;
+  trbvh_geometry        input;           /* with the defaults filled in */
+  trbvh_options         options;         /* likewise: resolved */
+  trbvh_stats           stats;
+  trb_runner            runner;
+  trb_costs             costs;
+  trb_grid              grid;
+  uint32_t              ref_max, ref_count, split_max;
+  /* scratch memory; what stands on one line shares it, one after the other */
+  void                 *scratch;
+  size_t                scratch_size;
+  trbvh_node           *refs;            /* ref_max, sorted by primitive */      uint32_t *lists;  /* 8 * ref_max, once refs are leaves */
+  trb_u64              *keys, *sorted;   /* ref_max each */                      float *priorities;
+  trbvh_node           *nodes;           /* 2 * ref_max */                       trbvh_node *unsplit;
+  trb_block            *blocks;
+  uint32_t             *histograms;
+  trb_range            *ranges;
+  trb_group            *groups;
+  trb_task             *tasks;
+  uint32_t              block_count, group_count, task_count;
+  /* parameters of the jobs at work */
+  float                 priority_unit;
+  trb_u64               scale;
+  int                   key_high;
+  uint32_t              key_bits, key_shift, digit_shift;
+  trb_u64               index_mask;
+  uint32_t              gamma;
+  trbvh                 tree;            /* the result, as it is made */
+} trb_build;
+
+static trbvh_result trb_fail(trb_build *b, trbvh_result result, const char *format, unsigned a, unsigned c, unsigned d) {
+  snprintf(b->stats.message, sizeof b->stats.message, format, a, c, d);
+  return result;
+}
+
+/* The geometry with its defaults filled in. */
+static trbvh_result trb_resolve_geometry(trb_build *b) {
+  trbvh_geometry *g = &b->input;
+  if (!b->geometry) return trb_fail(b, TRBVH_INVALID_ARGUMENT, "geometry is NULL", 0, 0, 0);
+  *g = *b->geometry;
+  if (g->count == 0) return TRBVH_OK;
+  if (g->count > TRB_REFS_MAX)
+    return trb_fail(b, TRBVH_TOO_LARGE, "%u primitives, more than %u", g->count, TRB_REFS_MAX, 0);
+  if (!g->positions == !g->boxes)
+    return trb_fail(b, TRBVH_INVALID_ARGUMENT, "geometry needs either positions or boxes", 0, 0, 0);
+  if (g->boxes) {
+    if (g->indices) return trb_fail(b, TRBVH_INVALID_ARGUMENT, "boxes have no indices", 0, 0, 0);
+    if (g->box_stride == 0) g->box_stride = 24;
+    if (g->box_stride < 24)
+      return trb_fail(b, TRBVH_INVALID_ARGUMENT, "box_stride is %u, a box has 24 bytes", (unsigned)g->box_stride, 0, 0);
+    return TRBVH_OK;
+  }
+  if (g->position_stride == 0) g->position_stride = 12;
+  if (g->position_stride < 12)
+    return trb_fail(b, TRBVH_INVALID_ARGUMENT, "position_stride is %u, a position has 12 bytes",
+                    (unsigned)g->position_stride, 0, 0);
+  if (g->indices) {
+    if (g->index_size == 0) g->index_size = 4;
+    if (g->index_size != 2 && g->index_size != 4)
+      return trb_fail(b, TRBVH_INVALID_ARGUMENT, "index_size is %u, neither 2 nor 4", g->index_size, 0, 0);
+    if (g->position_count == 0)
+      return trb_fail(b, TRBVH_INVALID_ARGUMENT, "indices need position_count, to be checked against", 0, 0, 0);
+  } else if (g->position_count && g->position_count / 3 < g->count) {
+    return trb_fail(b, TRBVH_INVALID_ARGUMENT, "%u triangles without indices need three positions each, but there are %u",
+                    g->count, g->position_count, 0);
+  }
+  return TRBVH_OK;
+}
+
+/* The options with the preset's values filled in: afterwards nothing is zero to mean a default. */
+static trbvh_result trb_resolve_options(trb_build *b, const trbvh_options *options) {
+  trbvh_options *o = &b->options;
+  int fast, high;
+  memset(o, 0, sizeof *o);
+  if (options) *o = *options;
+  if ((unsigned)o->quality > TRBVH_QUALITY_BEST)
+    return trb_fail(b, TRBVH_INVALID_ARGUMENT, "quality is %u, the best is %u", (unsigned)o->quality, TRBVH_QUALITY_BEST, 0);
+  if (o->flags & ~(uint32_t)(TRBVH_NO_FALLBACK | TRBVH_NO_TRIANGLES))
+    return trb_fail(b, TRBVH_INVALID_ARGUMENT, "flags 0x%x are unknown to this version", o->flags, 0, 0);
+  if (!o->allocator.alloc != !o->allocator.free)
+    return trb_fail(b, TRBVH_INVALID_ARGUMENT, "an allocator needs both alloc and free", 0, 0, 0);
+  if (!(o->split_budget <= 16))
+    return trb_fail(b, TRBVH_INVALID_ARGUMENT, "split_budget is above 16, or NaN", 0, 0, 0);
+  if (!(o->cost_node <= 1e6f && o->cost_prim <= 1e6f))
+    return trb_fail(b, TRBVH_INVALID_ARGUMENT, "cost_node or cost_prim is above 1000000, or NaN", 0, 0, 0);
+  fast = o->quality == TRBVH_QUALITY_FAST;
+  high = o->quality >= TRBVH_QUALITY_HIGH;
+  if (o->split_budget == 0 && high) o->split_budget = 0.3f;
+  if (o->split_budget < 0 || b->input.boxes) o->split_budget = 0;
+  if (o->treelet_rounds == 0 && !fast) o->treelet_rounds = 3;
+  if (o->treelet_rounds < 0) o->treelet_rounds = 0;
+  if (o->max_leaf == 0) o->max_leaf = 8;
+  if (o->max_leaf > TRB_MAX_LEAF) o->max_leaf = TRB_MAX_LEAF;
+  if (o->cost_node == 0) o->cost_node = 1.2f;
+  if (o->cost_prim == 0) o->cost_prim = 1;
+  if (o->cost_node < 0) o->cost_node = 0;
+  if (o->cost_prim < 0) o->cost_prim = 0;
+  b->costs.max_leaf = o->max_leaf;
+  b->costs.ratio = o->cost_prim / TRB_MAX(o->cost_node, 1e-6f);    /* one division, for all backends */
+  return TRBVH_OK;
+}
+
+/* How many references there may be. */
+static trbvh_result trb_resolve_size(trb_build *b) {
+  trb_u64 extra = (trb_u64)((double)b->options.split_budget * b->input.count);
+  trb_u64 refs = b->input.count + extra;
+  if (refs > TRB_REFS_MAX || refs > (SIZE_MAX - 65536) / 160)
+    return trb_fail(b, TRBVH_TOO_LARGE, "%u primitives make more references than fit", b->input.count, 0, 0);
+  b->split_max = (uint32_t)extra;
+  b->ref_max = (uint32_t)refs;
+  return TRBVH_OK;
+}
+
+static trbvh_result trb_resolve(trb_build *b, const trbvh_geometry *geometry, const trbvh_options *options) {
+  trbvh_result result;
+  memset(b, 0, sizeof *b);
+  b->geometry = geometry;
+  result = trb_resolve_geometry(b);
+  if (!result) result = trb_resolve_options(b, options);
+  if (!result) result = trb_resolve_size(b);
+  return result;
+}
+
+static uint32_t trb_blocks(uint32_t count, uint32_t size) { return count / size + (count % size != 0); }
+
+/* The scratch memory's parts, one after another; NULL as base to learn the size. */
+static size_t trb_lay_out(trb_build *b, char *base) {
+  const size_t n = b->ref_max, blocks = trb_blocks(b->ref_max, TRB_BLOCK);
+  size_t size = 0;
+  #define TRB_PART(member, type, bytes) \
+    b->member = base ? (type *)(void *)(base + size) : NULL; \
+    size = (size + (bytes) + TRB_LINE - 1) & ~(size_t)(TRB_LINE - 1);
+  TRB_PART(refs,       trbvh_node, n * TRB_NODE_BYTES)
+  TRB_PART(keys,       trb_u64,    n * 8)
+  TRB_PART(sorted,     trb_u64,    n * 8)
+  TRB_PART(nodes,      trbvh_node, n * 2 * TRB_NODE_BYTES)
+  TRB_PART(blocks,     trb_block,  blocks * sizeof(trb_block))
+  TRB_PART(ranges,     trb_range,  blocks * sizeof(trb_range))
+  TRB_PART(groups,     trb_group,  blocks * sizeof(trb_group))
+  TRB_PART(tasks,      trb_task,   (TRBVH_MAX_DEPTH * (n / TRB_BLOCK) + 1) * sizeof(trb_task))
+  TRB_PART(histograms, uint32_t,   trb_blocks(b->ref_max, TRB_SORT_BLOCK) * TRB_DIGITS * sizeof(uint32_t))
+  #undef TRB_PART
+  b->lists = (uint32_t *)(void *)b->refs;
+  b->priorities = (float *)(void *)b->keys;
+  b->unsplit = b->split_max ? b->nodes : b->refs;
+  return size + TRB_LINE;
+}
+
+static size_t trb_result_size(const trb_build *b, size_t leaves, size_t prims) {
+  int triangles = !b->input.boxes && !(b->options.flags & TRBVH_NO_TRIANGLES);
+  return leaves * 2 * TRB_NODE_BYTES + prims * (sizeof(uint32_t) + (triangles ? sizeof(trbvh_triangle) : 0)) + TRB_LINE;
+}
+
+TRBVH_API size_t trbvh_bytes_bound(const trbvh_geometry *geometry, const trbvh_options *options, size_t *scratch) {
+  trb_build b;
+  int fits = trb_resolve(&b, geometry, options) == TRBVH_OK && b.input.count > 0;
+  if (scratch) *scratch = fits ? trb_lay_out(&b, NULL) : 0;
+  return fits ? trb_result_size(&b, b.ref_max, b.ref_max) : 0;
+}
+
+static uint32_t trb_index(const trbvh_geometry *g, size_t i) {
+  uint32_t index;
+  uint16_t index16;
+  if (g->index_size == 2) {
+    memcpy(&index16, (const char *)g->indices + i * 2, 2);
+    return index16;
+  }
+  memcpy(&index, (const char *)g->indices + i * 4, 4);
+  return index;
+}
+
+/* The corners of triangle i; 0 where one of its indices is out of range, which vertex then tells. */
+static int trb_load_triangle(const trbvh_geometry *g, uint32_t i, float v[3][3], uint32_t *vertex) {
+  size_t k, corner = (size_t)i * 3;
+  for (k = 0; k < 3; k++) {
+    size_t position = corner + k;
+    if (g->indices) {
+      *vertex = trb_index(g, corner + k);
+      if (*vertex >= g->position_count) return 0;
+      position = *vertex;
+    }
+    memcpy(v[k], (const char *)g->positions + position * g->position_stride, 12);
+  }
+  return 1;
+}
+
+static trbvh_node trb_no_box(void) {
+  trbvh_node n;
+  int k;
+  for (k = 0; k < 3; k++) { n.min[k] = FLT_MAX; n.max[k] = -FLT_MAX; }
+  n.first = n.count = 0;
+  return n;
+}
+
+static void trb_include(trbvh_node *n, const float low[3], const float high[3]) {
+  int k;
+  for (k = 0; k < 3; k++) {
+    n->min[k] = TRB_MIN(low[k], n->min[k]);
+    n->max[k] = TRB_MAX(high[k], n->max[k]);
+  }
+}
+
+/* 0 for a triangle with a NaN or infinity. */
+static int trb_triangle_box(const float v[3][3], trbvh_node *box) {
+  int k, finite = 1;
+  *box = trb_no_box();
+  for (k = 0; k < 3; k++) {
+    finite &= trb_finite(v[k][0]) & trb_finite(v[k][1]) & trb_finite(v[k][2]);
+    trb_include(box, v[k], v[k]);
+  }
+  return finite;
+}
+
+static int trb_valid_box(trbvh_node box) {
+  int k, valid = 1;
+  for (k = 0; k < 3; k++) valid &= trb_finite(box.min[k]) & trb_finite(box.max[k]) & (box.min[k] <= box.max[k]);
+  return valid;
+}
+
+/* The box of primitive i: 1, or 0 where it is to be skipped, -1 where it has an index out of range. A triangle's
+ * corners go to v. */
+static int trb_prim_box(const trbvh_geometry *g, uint32_t i, trbvh_node *box, float v[3][3], uint32_t *vertex) {
+  if (!g->boxes) return trb_load_triangle(g, i, v, vertex) ? trb_triangle_box((const float (*)[3])v, box) : -1;
+  memcpy(box->min, (const char *)g->boxes + (size_t)i * g->box_stride, 12);
+  memcpy(box->max, (const char *)g->boxes + (size_t)i * g->box_stride + 12, 12);
+  return trb_valid_box(*box);
+}
+
+/* The boxes of a block's primitives, without the invalid ones. */
+static void trb_read_job(void *context, uint32_t index) {
+  trb_build *b = (trb_build *)context;
+  const trbvh_geometry *g = &b->input;
+  uint32_t i = index * TRB_BLOCK, end = TRB_MIN(g->count, i + TRB_BLOCK);
+  trb_block block;
+  memset(&block, 0, sizeof block);
+  block.bounds = block.centres = trb_no_box();
+  block.start = i;
+  block.bad = TRBVH_NONE;
+  for (; i < end; i++) {
+    trbvh_node box;
+    float v[3][3], centre[3];
+    int k, valid = trb_prim_box(g, i, &box, v, &block.bad_vertex);
+    if (valid < 0) {
+      block.bad = i;
+      break;
+    }
+    if (!valid) {
+      block.skipped++;
+      continue;
+    }
+    for (k = 0; k < 3; k++) centre[k] = 0.5f * box.min[k] + 0.5f * box.max[k];
+    trb_include(&block.bounds, box.min, box.max);
+    trb_include(&block.centres, centre, centre);
+    box.first = i;
+    b->unsplit[block.start + block.count++] = box;
+  }
+  b->blocks[index] = block;
+}
+
+/* All references: what the blocks found, with their gaps closed. Fails for an index out of range. */
+static trbvh_result trb_read(trb_build *b) {
+  trbvh_node bounds = trb_no_box(), centres = trb_no_box();
+  float extent = 0;
+  uint32_t i;
+  int k;
+  b->block_count = trb_blocks(b->input.count, TRB_BLOCK);
+  if (trb_run(&b->runner, b->block_count, trb_read_job, b)) return TRBVH_CANCELLED;
+  for (i = 0; i < b->block_count; i++) {
+    trb_block *block = &b->blocks[i];
+    if (block->bad != TRBVH_NONE)
+      return trb_fail(b, TRBVH_BAD_GEOMETRY, "triangle %u uses vertex %u, but there are %u", block->bad,
+                      block->bad_vertex, b->input.position_count);
+    b->stats.skipped_count += block->skipped;
+    trb_include(&bounds, block->bounds.min, block->bounds.max);
+    trb_include(&centres, block->centres.min, block->centres.max);
+  }
+  /* Fragments lie anywhere in the scene, and should be cut where the hierarchy will be. */
+  if (!b->split_max) bounds = centres;
+  for (k = 0; k < 3; k++) {
+    float side = bounds.max[k] - bounds.min[k];
+    b->grid.origin[k] = bounds.min[k];
+    extent = TRB_MAX(side, extent);
+  }
+  b->grid.cells_per_unit = extent > 1e-30f && extent < FLT_MAX ? 2097152.0f / extent : 0;
+  b->grid.units_per_cell = extent * (1.0f / 2097152.0f);
+  return TRBVH_OK;
+}
+
+/* Moves the blocks' references together, and counts them. */
+static void trb_close_gaps(trb_build *b, trbvh_node *refs) {
+  uint32_t i;
+  b->ref_count = 0;
+  for (i = 0; i < b->block_count; i++) {
+    const trb_block *block = &b->blocks[i];
+    if (block->start != b->ref_count)
+      memmove(refs + b->ref_count, refs + block->start, block->count * TRB_NODE_BYTES);
+    b->ref_count += block->count;
+  }
+}
+
+// >>splits ---- the paper's section 4: fewer, better used references than a spatial split builder's -----------------
+/* Every triangle t gets s(t) = floor(D p(t)) splits, p its priority, with the largest scale D that keeps their sum
+ * within the budget, found by bisection. Priorities are rounded to 24-bit integers first, so that all sums are exact
+ * and their order does not matter. A triangle is cut at the most important median plane in its box; what is left of
+ * its splits after this one goes to the halves by their longest sides; and so on down to no splits. */
+#define TRB_SCALE_BITS 36
+
+static void trb_priority_job(void *context, uint32_t index) {
+  trb_build *b = (trb_build *)context;
+  trb_block *block = &b->blocks[index];
+  uint32_t i, vertex;
+  float v[3][3];
+  block->priority = 0;
+  for (i = block->start; i < block->start + block->count; i++) {
+    trb_load_triangle(&b->input, b->unsplit[i].first, v, &vertex);
+    b->priorities[i] = trb_split_priority((const float (*)[3])v, b->unsplit[i], b->grid);
+    block->priority = TRB_MAX(b->priorities[i], block->priority);
+  }
+}
+
+/* Splits of reference i at the present scale. */
+static trb_u64 trb_splits(const trb_build *b, uint32_t i) {
+  return ((trb_u64)(uint32_t)(b->priorities[i] * b->priority_unit) * b->scale) >> TRB_SCALE_BITS;
+}
+
+static void trb_sum_splits_job(void *context, uint32_t index) {
+  trb_build *b = (trb_build *)context;
+  trb_block *block = &b->blocks[index];
+  uint32_t i;
+  block->splits = 0;
+  for (i = block->start; i < block->start + block->count; i++) block->splits += trb_splits(b, i);
+}
+
+static trb_u64 trb_sum_splits(trb_build *b, trb_u64 scale) {
+  trb_u64 sum = 0;
+  uint32_t i;
+  b->scale = scale;
+  trb_run(&b->runner, b->block_count, trb_sum_splits_job, b);
+  for (i = 0; i < b->block_count; i++) sum += b->blocks[i].splits;
+  return sum;
+}
+
+static trb_u64 trb_ratio(trb_u64 a, trb_u64 b, trb_u64 c, trb_u64 largest) {       /* a b / c, up to largest */
+  double ratio = (double)a * (double)b / (double)c;
+  return ratio < (double)largest ? (trb_u64)ratio : largest;
+}
+
+/* The scale, by the paper's bisection between D_min = S_max / sum p and D_max = D_min S_max / S(D_min). */
+static trb_u64 trb_find_scale(trb_build *b) {
+  const trb_u64 budget = b->split_max, largest = (trb_u64)1 << 40;
+  trb_u64 sum = trb_sum_splits(b, (trb_u64)1 << TRB_SCALE_BITS), low, high, made;
+  int step;
+  if (sum == 0) return 0;
+  low = trb_ratio(budget, (trb_u64)1 << TRB_SCALE_BITS, sum, largest);
+  made = trb_sum_splits(b, low);
+  high = made ? trb_ratio(low, budget, made, largest) : largest;
+  for (step = 0; step < 40 && high - low > low / 64 + 1; step++) {
+    trb_u64 middle = low + (high - low) / 2;
+    if (trb_sum_splits(b, middle) <= budget) low = middle;
+    else high = middle;
+  }
+  return low;
+}
+
+/* Cuts one reference into up to splits + 1, left before right. */
+static uint32_t trb_split_reference(const trb_build *b, trbvh_node ref, uint32_t splits, trbvh_node *out) {
+  struct { trbvh_node box; uint32_t splits; } stack[TRB_SPLIT_STACK];
+  uint32_t top = 0, count = 0, vertex;
+  float v[3][3];
+  if (splits) trb_load_triangle(&b->input, ref.first, v, &vertex);
+  stack[top].box = ref;
+  stack[top++].splits = splits;
+  while (top) {
+    trbvh_node left, right;
+    trb_plane plane;
+    int in_left, in_right;
+    uint32_t rest = stack[--top].splits;
+    left = right = stack[top].box;
+    if (rest == 0 || top + 2 > TRB_SPLIT_STACK || !trb_choose_plane(left, b->grid, &plane)) {
+      out[count++] = left;
+      continue;
+    }
+    left.max[plane.axis] = right.min[plane.axis] = plane.position;
+    in_left = trb_clip((const float (*)[3])v, &left);
+    in_right = trb_clip((const float (*)[3])v, &right);
+    if (in_left && in_right) {
+      uint32_t share = trb_share(--rest, trb_longest_side(left), trb_longest_side(right));
+      stack[top].box = right;
+      stack[top++].splits = rest - share;
+      stack[top].box = left;
+      stack[top++].splits = share;
+    } else if (in_left || in_right) {                /* the triangle only touches the plane: try again within */
+      stack[top].box = in_left ? left : right;
+      stack[top++].splits = rest - 1;
+    } else {
+      out[count++] = stack[top].box;
+    }
+  }
+  return count;
+}
+
+static void trb_split_job(void *context, uint32_t index) {
+  trb_build *b = (trb_build *)context;
+  trb_block *block = &b->blocks[index];
+  uint32_t i, count = 0;
+  for (i = block->start; i < block->start + block->count; i++)
+    count += trb_split_reference(b, b->unsplit[i], (uint32_t)trb_splits(b, i), b->refs + block->split_start + count);
+  block->count = count;
+}
+
+static trbvh_result trb_split(trb_build *b) {
+  uint32_t i, start = 0;
+  float largest = 0;
+  if (trb_run(&b->runner, b->block_count, trb_priority_job, b)) return TRBVH_CANCELLED;
+  for (i = 0; i < b->block_count; i++) largest = TRB_MAX(b->blocks[i].priority, largest);
+  /* the power of two that takes the largest priority to 24 bits */
+  i = TRB_MAX(trb_bits(largest) >> 23, 24u);
+  b->priority_unit = trb_float((127u + 127u + 23u - i) << 23);
+  trb_sum_splits(b, trb_find_scale(b));
+  if (b->runner.cancelled) return TRBVH_CANCELLED;
+  for (i = 0; i < b->block_count; i++) {
+    b->blocks[i].split_start = start;
+    start += b->blocks[i].count + (uint32_t)b->blocks[i].splits;
+  }
+  if (trb_run(&b->runner, b->block_count, trb_split_job, b)) return TRBVH_CANCELLED;
+  for (i = 0; i < b->block_count; i++) b->blocks[i].start = b->blocks[i].split_start;
+  return TRBVH_OK;
+}
+
+// >>sort ---- references along the Morton curve: a stable radix sort of 64-bit keys ---------------------------------
+/* Up to TRB_PACKED_REFS references a key holds the leading bits of the Morton code above the reference's index, so
+ * that keys differ and carry what they sort: 44 bits of code up to 2^19 references, 39 at 2^24. Only the code's digits
+ * are sorted; indices are in order already. Above that, all 63 bits count: references are sorted by the low 31 bits
+ * of their codes, then by the high 32, with the same keys of half code, half index. */
+static int trb_packed(const trb_build *b) { return b->ref_count <= TRB_PACKED_REFS; }
+
+static void trb_key_job(void *context, uint32_t index) {
+  trb_build *b = (trb_build *)context;
+  uint32_t i = index * TRB_BLOCK, end = TRB_MIN(b->ref_count, i + TRB_BLOCK);
+  for (; i < end; i++) {
+    uint32_t ref = b->key_high ? (uint32_t)b->keys[i] : i;
+    trb_u64 code = trb_morton(b->refs[ref], b->grid);
+    if (!trb_packed(b)) code = b->key_high ? code >> 31 : code & 0x7FFFFFFFu;
+    else code >>= 63 - b->key_bits;
+    b->keys[i] = code << b->key_shift | ref;
+  }
+}
+
+static void trb_histogram_job(void *context, uint32_t index) {
+  trb_build *b = (trb_build *)context;
+  uint32_t i = index * TRB_SORT_BLOCK, end = TRB_MIN(b->ref_count, i + TRB_SORT_BLOCK);
+  uint32_t *histogram = b->histograms + (size_t)index * TRB_DIGITS;
+  memset(histogram, 0, TRB_DIGITS * sizeof *histogram);
+  for (; i < end; i++) histogram[(b->keys[i] >> b->digit_shift) & (TRB_DIGITS - 1)]++;
+}
+
+static void trb_scatter_job(void *context, uint32_t index) {
+  trb_build *b = (trb_build *)context;
+  uint32_t i = index * TRB_SORT_BLOCK, end = TRB_MIN(b->ref_count, i + TRB_SORT_BLOCK);
+  uint32_t *next = b->histograms + (size_t)index * TRB_DIGITS;
+  for (; i < end; i++) {
+    trb_u64 key = b->keys[i];
+    b->sorted[next[(key >> b->digit_shift) & (TRB_DIGITS - 1)]++] = key;
+  }
+}
+
+/* By bits [shift, shift + bits) of the keys. */
+static int trb_sort(trb_build *b, uint32_t shift, uint32_t bits) {
+  const uint32_t blocks = trb_blocks(b->ref_count, TRB_SORT_BLOCK);
+  for (b->digit_shift = shift; b->digit_shift < shift + bits; b->digit_shift += TRB_DIGIT_BITS) {
+    trb_u64 *swap = b->keys;
+    uint32_t digit, block, start = 0;
+    if (trb_run(&b->runner, blocks, trb_histogram_job, b)) return 1;
+    for (digit = 0; digit < TRB_DIGITS; digit++)
+      for (block = 0; block < blocks; block++) {
+        uint32_t *count = b->histograms + (size_t)block * TRB_DIGITS + digit, n = *count;
+        *count = start;
+        start += n;
+      }
+    if (trb_run(&b->runner, blocks, trb_scatter_job, b)) return 1;
+    b->keys = b->sorted;
+    b->sorted = swap;
+  }
+  return 0;
+}
+
+static int trb_key_jobs(trb_build *b, int high) {
+  b->key_high = high;
+  return trb_run(&b->runner, trb_blocks(b->ref_count, TRB_BLOCK), trb_key_job, b);
+}
+
+static trbvh_result trb_make_keys(trb_build *b) {
+  b->key_bits = 31;
+  b->key_shift = 32;
+  if (trb_packed(b)) {
+    b->key_shift = b->ref_count > 1 ? trb_log2(b->ref_count - 1) + 1 : 1;
+    b->key_bits = TRB_MIN(63 - b->key_shift, TRB_CODE_BITS);
+  }
+  return trb_key_jobs(b, 0) ? TRBVH_CANCELLED : TRBVH_OK;
+}
+
+static trbvh_result trb_sort_keys(trb_build *b) {
+  int cancelled = trb_sort(b, b->key_shift, b->key_bits);
+  if (!trb_packed(b)) cancelled = cancelled || trb_key_jobs(b, 1) || trb_sort(b, 32, 32);
+  return cancelled ? TRBVH_CANCELLED : TRBVH_OK;
+}
+
+// >>hierarchy ---- the linear BVH (Karras 2012, "Maximizing Parallelism in the Construction of BVHs, Octrees...") ----
+/* The binary radix tree over the sorted keys: every node splits its range where the highest bit changes. On a CPU one
+ * pass over the leaves is fastest: neighbours differ by exclusive or, a smaller value splits deeper; subtrees wait on
+ * a stack for a shallower split to their right, which makes them the left child of what follows them (the Cartesian
+ * tree). Blocks of leaves are built alone; subtrees whose parents reach beyond their block stay open, and the same
+ * pass over them makes the top of the tree. Children stand before their parents, in cache lines of their own. */
+typedef struct trb_forest {
+  trbvh_node *nodes;
+  trb_costs   costs;
+  trb_u64     left_split;                /* between the bottom of the stack and what is left of it */
+  uint32_t    next_pair, height;
+  trb_open    stack[TRB_OPEN_MAX];
+  trb_range  *range;                     /* where subtrees that stay open go */
+} trb_forest;
+
+static trbvh_node trb_join(trb_forest *f, trbvh_node left, trbvh_node right, uint32_t pair) {
+  f->nodes[2 * pair] = left;
+  f->nodes[2 * pair + 1] = right;
+  return trb_parent(left, right, 2 * pair, f->costs);
+}
+
+static void trb_leave_open(trb_forest *f, const trb_open *subtree) {
+  TRBVH_ASSERT(f->range->open_count < TRB_OPEN_MAX);
+  f->range->open[f->range->open_count++] = *subtree;
+}
+
+/* The next subtree from the left; split is between it and its right neighbour; pair is for their parent, or 0. */
+static void trb_push(trb_forest *f, trbvh_node node, trb_u64 split, uint32_t pair) {
+  trb_open *top;
+  while (f->height && f->stack[f->height - 1].split <= split) {
+    top = &f->stack[--f->height];
+    if (f->height || f->left_split >= top->split) {
+      node = trb_join(f, top->node, node, top->pair ? top->pair : f->next_pair++);
+    } else {                             /* their parent begins left of the block */
+      f->left_split = top->split;
+      trb_leave_open(f, top);
+    }
+  }
+  TRBVH_ASSERT(f->height < TRB_OPEN_MAX);
+  top = &f->stack[f->height++];
+  top->node = node;
+  top->split = split;
+  top->pair = pair;
+}
+
+#define TRB_NO_SPLIT (~(trb_u64)0)       /* shallower than any: the end of the scene */
+
+/* What splits sorted leaf i from leaf i + 1: larger is shallower. */
+static trb_u64 trb_split_after(const trb_build *b, uint32_t i) {
+  trb_u64 a, c, code;
+  if (i >= b->ref_count - 1) return TRB_NO_SPLIT;     /* also for 0 - 1 */
+  a = b->keys[i];
+  c = b->keys[i + 1];
+  if (trb_packed(b)) return a ^ c;
+  code = trb_morton(b->refs[(uint32_t)a], b->grid) ^ trb_morton(b->refs[(uint32_t)c], b->grid);
+  return code ? code | (trb_u64)1 << 63 : (uint32_t)(a ^ c);
+}
+
+static void trb_forest_start(trb_forest *f, const trb_build *b, trb_u64 left_split, uint32_t pair, trb_range *range) {
+  f->nodes = b->nodes;
+  f->costs = b->costs;
+  f->left_split = left_split;
+  f->next_pair = pair;
+  f->height = 0;
+  f->range = range;
+}
+
+static void trb_hierarchy_job(void *context, uint32_t index) {
+  trb_build *b = (trb_build *)context;
+  uint32_t first = index * TRB_BLOCK, end = TRB_MIN(b->ref_count, first + TRB_BLOCK), i;
+  trb_range *range = &b->ranges[index];
+  trb_forest f;
+  range->open_count = 0;
+  trb_forest_start(&f, b, trb_split_after(b, first - 1), first + 1, range);
+  for (i = first; i < end; i++) {
+    trbvh_node ref = b->refs[b->keys[i] & b->index_mask];
+    if (i + TRB_AHEAD < end) TRB_PREFETCH(&b->refs[b->keys[i + TRB_AHEAD] & b->index_mask]);
+    trb_push(&f, trb_reference(ref, b->costs), trb_split_after(b, i), 0);
+  }
+  for (i = 0; i < f.height; i++) trb_leave_open(&f, &f.stack[i]);
+  for (i = 0; i < range->open_count; i++) range->open[i].pair = f.next_pair + i;
+}
+
+/* Pairs of siblings are numbered from 1, and stand at twice that; the root is nodes[0]. */
+static trbvh_result trb_build_hierarchy(trb_build *b) {
+  const uint32_t blocks = trb_blocks(b->ref_count, TRB_BLOCK);
+  uint32_t i, k;
+  trb_forest f;
+  b->index_mask = trb_packed(b) ? ((trb_u64)1 << b->key_shift) - 1 : 0xFFFFFFFFu;
+  if (trb_run(&b->runner, blocks, trb_hierarchy_job, b)) return TRBVH_CANCELLED;
+  trb_forest_start(&f, b, TRB_NO_SPLIT, 0, NULL);
+  for (i = 0; i < blocks; i++)
+    for (k = 0; k < b->ranges[i].open_count; k++) {
+      const trb_open *open = &b->ranges[i].open[k];
+      trb_push(&f, open->node, open->split, open->pair);
+    }
+  TRBVH_ASSERT(f.height == 1);
+  b->nodes[0] = f.stack[0].node;
+  return TRBVH_OK;
+}
+
+// >>treelets ---- restructuring by dynamic programming (paper, section 3) -------------------------------------------
+/* In round r every node of 7 * 2^r references or more becomes the root of a treelet once, after both its children's
+ * subtrees have been through round r. Its two children are the first treelet leaves; five times, the one of largest
+ * area is replaced by its own children. If the best topology over the seven leaves beats the present one, the root,
+ * which keeps its place, gets it; the six pairs of siblings are used again. Nothing else is said about the order, and
+ * nothing depends on it: numbers of nodes never break a tie.
+ *
+ * Here, subtrees of up to TRB_BLOCK references are jobs. A job sorts its treelet roots by height, roots of one height
+ * being independent, and takes TRB_LANES of them at a time through the dynamic program; then the few roots above all
+ * jobs go the same way. */
+typedef struct trb_treelets {
+  float    leaves[TRB_TREELET * TRB_LEAF_VALUES * TRB_LANES];
+  float    table[TRB_SUBSETS * TRB_LANES + 16];  /* padded: leaves and table otherwise fall on the same cache sets */
+  float    area[TRB_TREELET - 1][TRB_LANES];     /* of the nodes expanded, the root first */
+  uint32_t slot[TRB_TREELET][TRB_LANES];         /* the treelet leaves' nodes ... */
+  uint32_t key[TRB_TREELET][TRB_LANES];          /* ... and their rank for expansion */
+  uint32_t pair[TRB_TREELET - 1][TRB_LANES];     /* where the children of the expanded nodes stand */
+  uint32_t parent[TRB_TREELET - 1][TRB_LANES];   /* which slot was expanded: left child there, right child in a new one */
+} trb_treelets;
+
+static void trb_expand(const trbvh_node *nodes, trb_treelets *t, uint32_t lane, uint32_t step, uint32_t slot, uint32_t node) {
+  uint32_t pair = nodes[node].first;
+  t->area[step][lane] = trb_area(nodes[node]);
+  t->pair[step][lane] = pair;
+  t->parent[step][lane] = slot;
+  t->slot[slot][lane] = pair;
+  t->slot[step + 1][lane] = pair + 1;
+  t->key[slot][lane] = trb_expand_key(nodes[pair], slot);
+  t->key[step + 1][lane] = trb_expand_key(nodes[pair + 1], step + 1);
+}
+
+/* Steps outside, lanes inside, so that one lane's cache misses hide behind the others' work. */
+static void trb_form_treelets(const trbvh_node *nodes, trb_treelets *t, const uint32_t *roots, uint32_t lanes) {
+  uint32_t lane, step, i;
+  for (lane = 0; lane < lanes; lane++) trb_expand(nodes, t, lane, 0, 0, roots[lane]);
+  for (step = 1; step < TRB_TREELET - 1; step++)
+    for (lane = 0; lane < lanes; lane++) {
+      uint32_t best = t->key[0][lane];
+      for (i = 1; i <= step; i++) best = TRB_MAX(t->key[i][lane], best);
+      i = TRB_TREELET - (best & 7u);
+      trb_expand(nodes, t, lane, step, i, t->slot[i][lane]);
+    }
+  for (i = 0; i < TRB_TREELET; i++)
+    for (lane = 0; lane < lanes; lane++) {
+      const trbvh_node *leaf = &nodes[t->slot[i][lane]];
+      float *value = &t->leaves[i * TRB_LEAF_VALUES * TRB_LANES + lane];
+      value[0 * TRB_LANES] = leaf->min[0];
+      value[1 * TRB_LANES] = leaf->min[1];
+      value[2 * TRB_LANES] = leaf->min[2];
+      value[3 * TRB_LANES] = leaf->max[0];
+      value[4 * TRB_LANES] = leaf->max[1];
+      value[5 * TRB_LANES] = leaf->max[2];
+      value[6 * TRB_LANES] = (float)trb_count(leaf->count);
+      value[7 * TRB_LANES] = trb_cost(leaf->count);
+    }
+}
+
+/* The cost of a treelet as it is, on the scale of trb_treelet_costs; uses up what it is told about the leaves. */
+static float trb_present_cost(trb_treelets *t, uint32_t lane, trb_costs costs) {
+  float cost[TRB_TREELET] = {0, 0, 0, 0, 0, 0, 0};
+  uint32_t step = TRB_TREELET - 1;
+  while (step--) {                                   /* last expanded first: children before parents */
+    uint32_t left = t->parent[step][lane], right = step + 1;
+    float *l = &t->leaves[left * TRB_LEAF_VALUES * TRB_LANES + lane];
+    const float *r = &t->leaves[right * TRB_LEAF_VALUES * TRB_LANES + lane];
+    float area = t->area[step][lane];
+    l[6 * TRB_LANES] += r[6 * TRB_LANES];
+    l[7 * TRB_LANES] += r[7 * TRB_LANES];
+    cost[left] = area + (cost[left] + cost[right]);
+    if (l[6 * TRB_LANES] <= (float)costs.max_leaf) {
+      float leaf = costs.ratio * area * l[6 * TRB_LANES] - l[7 * TRB_LANES];
+      cost[left] = TRB_MIN(leaf, cost[left]);
+    }
+  }
+  return cost[0];
+}
+
+/* Gives the root of a treelet the best topology. */
+static void trb_rebuild_treelet(trbvh_node *nodes, const trb_treelets *t, uint32_t lane, uint32_t root, trb_costs costs) {
+  trbvh_node leaf[TRB_TREELET];
+  uint32_t subset[TRB_TREELET - 1], node[TRB_TREELET - 1], count = 1, i, side;
+  for (i = 0; i < TRB_TREELET; i++) leaf[i] = nodes[t->slot[i][lane]];
+  subset[0] = TRB_SUBSETS - 1;
+  node[0] = root;
+  for (i = 0; i < TRB_TREELET - 1; i++) {            /* inner nodes from the root down, their children at pair i */
+    uint32_t part = trb_partition(t->table + lane, subset[i]);
+    for (side = 0; side < 2; side++, part ^= subset[i]) {
+      uint32_t child = t->pair[i][lane] + side;
+      if (TRB_SINGLE(part)) {
+        nodes[child] = leaf[trb_log2(part)];
+      } else {
+        subset[count] = part;
+        node[count++] = child;
+      }
+    }
+  }
+  while (i--) {
+    uint32_t pair = t->pair[i][lane];
+    nodes[node[i]] = trb_parent(nodes[pair], nodes[pair + 1], pair, costs);
+  }
+}
+
+/* Up to TRB_LANES roots, none above another. */
+static void trb_restructure(trbvh_node *nodes, trb_treelets *t, const uint32_t *roots, uint32_t lanes, trb_costs costs) {
+  uint32_t lane;
+  trb_form_treelets(nodes, t, roots, lanes);
+  for (lane = 0; lane < TRB_LANES; lane++) trb_treelet_costs(t->leaves + lane, t->table + lane, costs);
+  for (lane = 0; lane < lanes; lane++) {
+    float best = t->table[(TRB_SUBSETS - 1) * TRB_LANES + lane];
+    trbvh_node *root = &nodes[roots[lane]];
+    if (trb_improves(best, trb_present_cost(t, lane, costs))) trb_rebuild_treelet(nodes, t, lane, roots[lane], costs);
+    else if (trb_count(root->count) <= costs.max_leaf)         /* cheaper all the same, if a subtree below is */
+      *root = trb_parent(nodes[root->first], nodes[root->first + 1], root->first, costs);
+  }
+}
+
+/* All nodes of at least `smallest` references below the seeds, lowest first. space: four times `room` words, where
+ * room bounds their number, with the seeds at its start. */
+static void trb_restructure_below(trb_build *b, uint32_t *space, uint32_t room, uint32_t seeds, uint32_t smallest) {
+  const trbvh_node *nodes = b->nodes;
+  uint32_t *node = space, *parent = space + room, *height = parent + room, *sorted = height + room, *start = parent;
+  uint32_t count = seeds, highest = 0, i, k;
+  trb_treelets t;
+  memset(&t, 0, sizeof t);
+  for (i = 0; i < seeds; i++) parent[i] = TRBVH_NONE;
+  for (i = 0; i < count; i++) {                      /* breadth first, parents before children */
+    height[i] = 0;
+    for (k = 0; k < 2; k++) {
+      uint32_t child = nodes[node[i]].first + k;
+      if (trb_count(nodes[child].count) < smallest) continue;
+      parent[count] = i;
+      node[count++] = child;
+    }
+  }
+  TRBVH_ASSERT(count <= room);
+  for (i = count; i-- > 0;) {
+    highest = TRB_MAX(height[i], highest);
+    if (parent[i] != TRBVH_NONE) height[parent[i]] = TRB_MAX(height[i] + 1, height[parent[i]]);
+  }
+  for (i = 0; i <= highest + 1; i++) start[i] = 0;   /* counting sort; parents are no longer needed */
+  for (i = 0; i < count; i++) start[height[i] + 1]++;
+  for (i = 0; i < highest; i++) start[i + 1] += start[i];
+  for (i = 0; i < count; i++) sorted[start[height[i]]++] = node[i];
+  for (i = 0, k = 0; k <= highest; k++)              /* start[k] has moved to the end of height k */
+    for (; i < start[k]; i += TRB_MIN(TRB_LANES, start[k] - i))
+      trb_restructure(b->nodes, &t, sorted + i, TRB_MIN(TRB_LANES, start[k] - i), b->costs);
+}
+
+static void trb_treelet_job(void *context, uint32_t index) {
+  trb_build *b = (trb_build *)context;
+  const trb_group *group = &b->groups[index];
+  trb_restructure_below(b, b->lists + 4 * (size_t)group->first_ref, group->refs, group->seeds, b->gamma);
+}
+
+/* One round: groups of subtrees, then the nodes above them. */
+static int trb_round(trb_build *b, uint32_t gamma) {
+  uint32_t *top = (uint32_t *)(void *)b->keys, top_count = 0, i, k, first_ref = 0;
+  trb_group *group = NULL;
+  const uint32_t above = TRB_MAX(TRB_BLOCK + 1, gamma);
+  b->gamma = gamma;
+  b->group_count = 0;
+  top[top_count++] = 0;
+  for (i = 0; i < top_count; i++) {
+    const trbvh_node *node = &b->nodes[top[i]];
+    uint32_t count = trb_count(node->count);
+    if (count >= above) {
+      top[top_count++] = node->first;
+      top[top_count++] = node->first + 1;
+    } else if (count >= gamma) {
+      if (!group || group->refs >= TRB_BLOCK) {
+        group = &b->groups[b->group_count++];
+        group->first_ref = first_ref;
+        group->refs = group->seeds = 0;
+      }
+      b->lists[4 * (size_t)group->first_ref + group->seeds++] = top[i];
+      group->refs += count;
+      first_ref += count;
+    }
+  }
+  for (k = 0; k < b->group_count; k++) TRBVH_ASSERT(b->groups[k].refs < 2 * TRB_BLOCK);
+  if (trb_run(&b->runner, b->group_count, trb_treelet_job, b)) return 1;
+  if (trb_count(b->nodes[0].count) >= above) {
+    b->lists[0] = 0;
+    trb_restructure_below(b, b->lists, b->ref_count, 1, above);
+  }
+  return 0;
+}
+
+// >>collapse ---- subtrees that are cheaper as leaves become leaves, and the tree moves into its final layout --------
+/* Every small node knows already whether it is better as a leaf (equation 2, trb_parent); the topmost such nodes
+ * become leaves. Two walks from the root down, in the same order, left before right: the first counts leaves and
+ * primitives, the second writes; in between, the result is allocated and prefix sums tell every job its place. Nodes
+ * lie in depth-first order, primitives in the order of their leaves.
+ *
+ * The depth bound: a node at depth d with n references can always be made a balanced subtree that ends at depth
+ * d + ceil(log2 n). Where a child could no longer be made so within TRBVH_MAX_DEPTH, its parent still can, and is. As
+ * this holds at the root, it holds everywhere. */
+
+/* The balanced tree over `count` leaves; returns its root, and takes its inner nodes' places from pairs. */
+static trbvh_node trb_balanced(trb_build *b, const trbvh_node *leaves, uint32_t count, const uint32_t **pairs) {
+  uint32_t half = count / 2, pair;
+  trbvh_node left, right;
+  if (count == 1) return leaves[0];
+  pair = *(*pairs)++;
+  left = trb_balanced(b, leaves, half, pairs);
+  right = trb_balanced(b, leaves + half, count - half, pairs);
+  b->nodes[pair] = left;
+  b->nodes[pair + 1] = right;
+  return trb_parent(left, right, pair, b->costs);
+}
+
+/* Rebuilds a subtree, the first of whose references is the first_ref-th of the tree. */
+static void trb_balance(trb_build *b, uint32_t node, uint32_t first_ref) {
+  uint32_t count = trb_count(b->nodes[node].count), leaves = 0, inner = 0, waiting = 0;
+  trbvh_node *leaf = b->refs + first_ref;            /* free by now, as are the keys */
+  uint32_t *pairs = (uint32_t *)(void *)(b->keys + first_ref);
+  uint32_t *stack = (uint32_t *)(void *)(b->sorted + first_ref);
+  const uint32_t *next = pairs;
+  stack[waiting++] = node;
+  while (waiting) {
+    trbvh_node n = b->nodes[stack[--waiting]];
+    if (trb_count(n.count) == 1) {
+      leaf[leaves++] = n;
+    } else {
+      pairs[inner++] = n.first;
+      stack[waiting++] = n.first + 1;
+      stack[waiting++] = n.first;
+    }
+  }
+  TRBVH_ASSERT(leaves == count && inner + 1 == count);
+  b->nodes[node] = trb_balanced(b, leaf, count, &next);
+}
+
+static int trb_too_deep(uint32_t depth, trbvh_u32 word) {
+  uint32_t count = trb_count(word);
+  return count > 1 && depth + trb_log2(count - 1) + 1 > TRBVH_MAX_DEPTH;
+}
+
+/* Node i, at this depth, once its children can stay within the bound. No tree of 2^31 references needs looking at
+ * above half of it. */
+static trbvh_node trb_bounded_node(trb_build *b, uint32_t i, uint32_t depth, uint32_t first_ref) {
+  trbvh_node node = b->nodes[i];
+  if (depth >= TRBVH_MAX_DEPTH / 2 && !trb_is_leaf(node.count) &&
+      (trb_too_deep(depth + 1, b->nodes[node.first].count) || trb_too_deep(depth + 1, b->nodes[node.first + 1].count))) {
+    trb_balance(b, i, first_ref);
+    node = b->nodes[i];
+  }
+  return node;
+}
+
+/* The primitives of a leaf, each once; returns how many. */
+static uint32_t trb_leaf_prims(const trb_build *b, uint32_t node, uint32_t prims[TRB_MAX_LEAF]) {
+  uint32_t stack[TRB_MAX_LEAF], waiting = 0, count = 0, i;
+  stack[waiting++] = node;
+  while (waiting) {
+    const trbvh_node *n = &b->nodes[stack[--waiting]];
+    if (trb_count(n->count) > 1) {
+      stack[waiting++] = n->first + 1;
+      stack[waiting++] = n->first;
+      continue;
+    }
+    for (i = 0; b->split_max && i < count && prims[i] != n->first; i++) {}
+    if (!b->split_max || i == count) prims[count++] = n->first;
+  }
+  return count;
+}
+
+typedef struct trb_visit { uint32_t node, dst, depth; } trb_visit;
+
+/* First walk, below one task's node: counts. */
+static void trb_count_job(void *context, uint32_t index) {
+  trb_build *b = (trb_build *)context;
+  trb_task *task = &b->tasks[index];
+  trb_visit stack[TRBVH_MAX_DEPTH + 1], v;
+  uint32_t waiting = 0, refs = task->first_ref, prims[TRB_MAX_LEAF];
+  task->leaves = task->prims = 0;
+  v.node = task->node;
+  v.depth = task->depth;
+  for (;;) {
+    trbvh_node node = trb_bounded_node(b, v.node, v.depth, refs);
+    if (!trb_is_leaf(node.count)) {
+      v.depth++;
+      v.node = node.first + 1;
+      stack[waiting++] = v;
+      v.node = node.first;
+      TRB_PREFETCH(&b->nodes[b->nodes[node.first + 1].first]);
+      continue;
+    }
+    task->leaves++;
+    task->prims += b->split_max ? trb_leaf_prims(b, v.node, prims) : trb_count(node.count);
+    refs += trb_count(node.count);
+    if (waiting == 0) break;
+    v = stack[--waiting];
+  }
+}
+
+/* First walk, above the tasks: finds them. */
+static void trb_find_tasks(trb_build *b) {
+  trb_visit stack[TRBVH_MAX_DEPTH + 1], v;
+  uint32_t waiting = 0, refs = 0;
+  b->task_count = 0;
+  v.node = v.depth = 0;
+  for (;;) {
+    trbvh_node node = trb_bounded_node(b, v.node, v.depth, refs);
+    if (trb_count(node.count) > TRB_BLOCK) {
+      v.depth++;
+      v.node = node.first + 1;
+      stack[waiting++] = v;
+      v.node = node.first;
+    } else {
+      trb_task *task = &b->tasks[b->task_count++];
+      task->node = v.node;
+      task->depth = v.depth;
+      task->first_ref = refs;
+      refs += trb_count(node.count);
+      if (waiting == 0) break;
+      v = stack[--waiting];
+    }
+  }
+}
+
+static trbvh_node *trb_out(const trb_build *b, uint32_t i) { return (trbvh_node *)(uintptr_t)&b->tree.nodes[i]; }
+
+/* Equation 1's sum, with half areas, in double. */
+static double trb_sah_term(const trbvh_node *node, double weight) {
+  double x = (double)node->max[0] - node->min[0], y = (double)node->max[1] - node->min[1];
+  double z = (double)node->max[2] - node->min[2];
+  return weight * (x * y + z * (x + y));
+}
+
+/* Writes an inner node whose children will be pair number `pair`. */
+static double trb_emit_inner(const trb_build *b, trbvh_node node, uint32_t dst, uint32_t pair) {
+  node.first = 2 * pair;
+  node.count = 0;
+  *trb_out(b, dst) = node;
+  return trb_sah_term(&node, b->options.cost_node);
+}
+
+/* Second walk, below one task's node: writes. */
+static void trb_emit_job(void *context, uint32_t index) {
+  trb_build *b = (trb_build *)context;
+  trb_task *task = &b->tasks[index];
+  uint32_t *out = (uint32_t *)(uintptr_t)b->tree.prims;
+  uint32_t waiting = 0, pair = task->pair, prim = task->first_prim, prims[TRB_MAX_LEAF];
+  trb_visit stack[TRBVH_MAX_DEPTH + 1], v;
+  v.node = task->node;
+  v.dst = task->dst;
+  v.depth = task->depth;
+  task->sah = 0;
+  task->max_depth = 0;
+  for (;;) {
+    trbvh_node node = b->nodes[v.node];
+    if (!trb_is_leaf(node.count)) {
+      task->sah += trb_emit_inner(b, node, v.dst, pair);
+      v.depth++;
+      v.dst = 2 * pair + 1;
+      v.node = node.first + 1;
+      stack[waiting++] = v;
+      v.dst = 2 * pair++;
+      v.node = node.first;
+      TRB_PREFETCH(&b->nodes[b->nodes[node.first + 1].first]);
+      continue;
+    }
+    node.count = trb_leaf_prims(b, v.node, prims);
+    node.first = prim;
+    memcpy(out + prim, prims, node.count * sizeof *out);
+    *trb_out(b, v.dst) = node;
+    task->sah += trb_sah_term(&node, (double)b->options.cost_prim * node.count);
+    task->max_depth = TRB_MAX(v.depth, task->max_depth);
+    prim += node.count;
+    if (waiting == 0) break;
+    v = stack[--waiting];
+  }
+  TRBVH_ASSERT(pair - task->pair == task->leaves - 1 && prim - task->first_prim == task->prims);
+}
+
+/* Second walk, above the tasks: writes, and tells them their places. The sum of equation 1 of what it wrote. */
+static double trb_emit_top(trb_build *b) {
+  trb_visit stack[TRBVH_MAX_DEPTH + 1], v;
+  uint32_t waiting = 0, pair = 1, prim = 0;
+  trb_task *task = b->tasks;
+  double sah = 0;
+  v.node = v.dst = v.depth = 0;
+  for (;;) {
+    trbvh_node node = b->nodes[v.node];
+    if (trb_count(node.count) > TRB_BLOCK) {
+      sah += trb_emit_inner(b, node, v.dst, pair);
+      v.dst = 2 * pair + 1;
+      v.node = node.first + 1;
+      stack[waiting++] = v;
+      v.dst = 2 * pair++;
+      v.node = node.first;
+    } else {
+      task->dst = v.dst;
+      task->pair = pair;
+      task->first_prim = prim;
+      pair += task->leaves - 1;
+      prim += task++->prims;
+      if (waiting == 0) return sah;
+      v = stack[--waiting];
+    }
+  }
+}
+
+/* Memory for the result: the old block where it is large enough, else a new one. */
+static trbvh_result trb_make_room(trb_build *b, trbvh *bvh, uint32_t leaves, uint32_t prims) {
+  const size_t size = trb_result_size(b, leaves, prims);
+  char *base;
+  if (bvh->block_size < size) {
+    trbvh_free(bvh);
+    bvh->allocator = b->options.allocator;
+    bvh->block = trb_alloc(&bvh->allocator, size);
+    if (!bvh->block)
+      return trb_fail(b, TRBVH_OUT_OF_MEMORY, "no memory for the tree: %u MiB", (unsigned)(size >> 20), 0, 0);
+    bvh->block_size = size;
+  }
+  base = trb_align(bvh->block);
+  b->tree.nodes = (trbvh_node *)(void *)base;
+  base += (size_t)leaves * 2 * TRB_NODE_BYTES;
+  b->tree.triangles = NULL;
+  if (!b->input.boxes && !(b->options.flags & TRBVH_NO_TRIANGLES)) {
+    b->tree.triangles = (trbvh_triangle *)(void *)base;
+    base += (size_t)prims * sizeof(trbvh_triangle);
+  }
+  b->tree.prims = (uint32_t *)(void *)base;
+  b->tree.node_count = 2 * leaves;
+  b->tree.ref_count = prims;
+  b->stats.bytes_result = size;
+  return TRBVH_OK;
+}
+
+static trbvh_result trb_collapse(trb_build *b, trbvh *bvh) {
+  uint32_t leaves = 0, prims = 0, i;
+  trbvh_result result;
+  double sah, root;
+  trb_find_tasks(b);
+  if (trb_run(&b->runner, b->task_count, trb_count_job, b)) return TRBVH_CANCELLED;
+  for (i = 0; i < b->task_count; i++) {
+    leaves += b->tasks[i].leaves;
+    prims += b->tasks[i].prims;
+  }
+  result = trb_make_room(b, bvh, leaves, prims);
+  if (result) return result;
+  memset(trb_out(b, 1), 0, TRB_NODE_BYTES);
+  sah = trb_emit_top(b);
+  if (trb_run(&b->runner, b->task_count, trb_emit_job, b)) return TRBVH_CANCELLED;
+  for (i = 0; i < b->task_count; i++) {
+    sah += b->tasks[i].sah;
+    b->stats.max_depth = TRB_MAX(b->tasks[i].max_depth, b->stats.max_depth);
+  }
+  root = trb_sah_term(&b->nodes[0], 1);
+  b->stats.sah_cost = root > 0 ? sah / root : 0;
+  b->stats.leaf_count = leaves;
+  b->stats.node_count = b->tree.node_count;
+  b->stats.ref_count = prims;
+  return TRBVH_OK;
+}
+
+// >>finish ---- triangles in leaf order -----------------------------------------------------------------------------
+static void trb_triangle_job(void *context, uint32_t index) {
+  const trb_build *b = (const trb_build *)context;
+  const uint32_t *prims = b->tree.prims;
+  uint32_t i = index * TRB_BLOCK, end = TRB_MIN(b->tree.ref_count, i + TRB_BLOCK), vertex;
+  trbvh_triangle *out = (trbvh_triangle *)(uintptr_t)b->tree.triangles;
+  for (; i < end; i++) {
+    float v[3][3];
+    int k;
+    trb_load_triangle(&b->input, prims[i], v, &vertex);
+    for (k = 0; k < 3; k++) {
+      out[i].v0[k] = v[0][k];
+      out[i].e1[k] = v[1][k] - v[0][k];
+      out[i].e2[k] = v[2][k] - v[0][k];
+    }
+    out[i].prim = prims[i];
+    out[i].reserved0 = out[i].reserved1 = 0;
+  }
+}
+
+// >>build -----------------------------------------------------------------------------------------------------------
+static trbvh_result trb_allocate_scratch(trb_build *b) {
+  b->scratch_size = trb_lay_out(b, NULL);
+  b->scratch = trb_alloc(&b->options.allocator, b->scratch_size);
+  if (!b->scratch)
+    return trb_fail(b, TRBVH_OUT_OF_MEMORY, "no scratch memory: %u MiB", (unsigned)(b->scratch_size >> 20), 0, 0);
+  b->stats.bytes_scratch = b->scratch_size;
+  trb_lay_out(b, trb_align(b->scratch));
+  return TRBVH_OK;
+}
+
+static trbvh_result trb_restructure_rounds(trb_build *b, float share) {
+  int32_t round;
+  for (round = 0; round < b->options.treelet_rounds && round < 28; round++) {
+    uint32_t gamma = (uint32_t)TRB_TREELET << round;
+    if (gamma > b->ref_count) break;
+    if (trb_stage(&b->runner, share * (round ? 0.2f : 0.6f)) || trb_round(b, gamma)) return TRBVH_CANCELLED;
+  }
+  return TRBVH_OK;
+}
+
+static trbvh_result trb_finish(trb_build *b) {
+  uint32_t jobs = b->tree.triangles ? trb_blocks(b->tree.ref_count, TRB_BLOCK) : 0;
+  return trb_run(&b->runner, jobs, trb_triangle_job, b) ? TRBVH_CANCELLED : TRBVH_OK;
+}
+
+/* Runs one stage, whose share of the time is an estimate for the progress report, and adds up its milliseconds. */
+#define TRB_STAGE(share, ms, call) \
+  if (!result) { \
+    double start = trb_ms(); \
+    result = trb_stage(&b->runner, share) ? TRBVH_CANCELLED : (call); \
+    b->stats.ms += trb_ms() - start; \
+  }
+
+static trbvh_result trb_run_stages(trb_build *b, trbvh *bvh) {
+  const float treelets = b->options.treelet_rounds ? 0.65f : 0, split = b->split_max ? 0.15f : 0;
+  const float rest = 1 - treelets - split;
+  trbvh_result result = trb_allocate_scratch(b);
+  TRB_STAGE(rest * 0.15f, ms_morton, trb_read(b))
+  if (b->split_max) { TRB_STAGE(split, ms_split, trb_split(b)) }
+  if (!result) trb_close_gaps(b, b->refs);
+  if (!result && b->ref_count == 0) return TRBVH_OK;
+  TRB_STAGE(rest * 0.05f, ms_morton, trb_make_keys(b))
+  TRB_STAGE(rest * 0.20f, ms_sort, trb_sort_keys(b))
+  TRB_STAGE(rest * 0.25f, ms_hierarchy, trb_build_hierarchy(b))
+  TRB_STAGE(0, ms_treelets, trb_restructure_rounds(b, treelets))
+  TRB_STAGE(rest * 0.20f, ms_collapse, trb_collapse(b, bvh))
+  TRB_STAGE(rest * 0.15f, ms_finish, trb_finish(b))
+  if (!result && trb_stage(&b->runner, 0)) result = TRBVH_CANCELLED;
+  return result;
+}
+
+TRBVH_API trbvh_result trbvh_build(trbvh *bvh, const trbvh_geometry *geometry, const trbvh_options *options) {
+  trb_build b;
+  double start = trb_ms();
+  trbvh_result result = trb_resolve(&b, geometry, options);
+  if (!bvh) result = trb_fail(&b, TRBVH_INVALID_ARGUMENT, "bvh is NULL", 0, 0, 0);
+  if (!result && b.options.device) {
+    trb_fail(&b, TRBVH_OK, "this version has no device backend: built in scalar C", 0, 0, 0);
+    if (b.options.flags & TRBVH_NO_FALLBACK) result = TRBVH_NO_DEVICE;
+  }
+  if (!result && b.input.count) {
+    trb_runner_start(&b.runner, &b.options, b.input.count > TRB_BLOCK);
+    result = trb_run_stages(&b, bvh);
+    trb_runner_stop(&b.runner);
+    trb_free(&b.options.allocator, b.scratch, b.scratch_size);
+  }
+  if (result && bvh) {
+    trbvh_free(bvh);
+  } else if (bvh) {
+    bvh->nodes = b.tree.nodes;
+    bvh->prims = b.tree.prims;
+    bvh->triangles = b.tree.triangles;
+    bvh->wide = NULL;
+    bvh->node_count = b.tree.node_count;
+    bvh->ref_count = b.tree.ref_count;
+    bvh->prim_count = b.input.count;
+    bvh->flags = b.options.flags;
+  }
+  if (result && !b.stats.message[0]) trb_fail(&b, result, trbvh_result_text(result), 0, 0, 0);
+  b.stats.ms_total = trb_ms() - start;
+  if (options && options->stats) *options->stats = b.stats;
+  return result;
+}
+
+// >>query -----------------------------------------------------------------------------------------------------------
+static int trb_query(const trbvh *bvh, const trbvh_ray *ray, int any, trbvh_hit *hit) {
+  trb_ray r;
+  if (!trb_prepare_ray(&r, ray) || !bvh->triangles) {
+    hit->t = r.tmax;
+    hit->u = hit->v = 0;
+    hit->prim = hit->instance = TRBVH_NONE;
+    return 0;
+  }
+  return any ? trb_trace(bvh->nodes, bvh->triangles, &r, 1, hit) : trb_trace(bvh->nodes, bvh->triangles, &r, 0, hit);
+}
+
+TRBVH_API int trbvh_intersect(const trbvh *bvh, const trbvh_ray *ray, trbvh_hit *hit) {
+  return trb_query(bvh, ray, 0, hit);
+}
+
+TRBVH_API int trbvh_occluded(const trbvh *bvh, const trbvh_ray *ray) {
+  trbvh_hit hit;
+  return trb_query(bvh, ray, 1, &hit);
+}
+
+#define TRB_RAY_BLOCK 1024u              /* rays a job traces */
+typedef struct trb_batch {
+  const trbvh     *bvh;
+  const trbvh_ray *rays;
+  trbvh_hit       *hits;
+  uint8_t         *occluded;
+  size_t           count;
+} trb_batch;
+
+static void trb_batch_job(void *context, uint32_t index) {
+  const trb_batch *batch = (const trb_batch *)context;
+  size_t i = (size_t)index * TRB_RAY_BLOCK, end = TRB_MIN(batch->count, i + TRB_RAY_BLOCK);
+  for (; i < end; i++)
+    if (batch->hits) trbvh_intersect(batch->bvh, &batch->rays[i], &batch->hits[i]);
+    else batch->occluded[i] = (uint8_t)trbvh_occluded(batch->bvh, &batch->rays[i]);
+}
+
+static trbvh_result trb_run_batch(trb_batch *batch, const trbvh_options *options) {
+  trb_build b;
+  trbvh_result result;
+  memset(&b, 0, sizeof b);
+  result = trb_resolve_options(&b, options);
+  if (!result && batch->count && (!batch->bvh || !batch->rays || (!batch->hits && !batch->occluded)))
+    result = trb_fail(&b, TRBVH_INVALID_ARGUMENT, "bvh, rays or results are NULL", 0, 0, 0);
+  if (!result && batch->count && batch->bvh->node_count && !batch->bvh->triangles)
+    result = trb_fail(&b, TRBVH_INVALID_ARGUMENT, "the tree has no triangles", 0, 0, 0);
+  if (!result && batch->count / TRB_RAY_BLOCK >= UINT32_MAX)
+    result = trb_fail(&b, TRBVH_TOO_LARGE, "too many rays for one call", 0, 0, 0);
+  if (!result && batch->count) {
+    uint32_t jobs = (uint32_t)((batch->count + TRB_RAY_BLOCK - 1) / TRB_RAY_BLOCK);
+    trb_runner_start(&b.runner, &b.options, jobs > 1);
+    trb_stage(&b.runner, 1);
+    if (trb_run(&b.runner, jobs, trb_batch_job, batch) || trb_stage(&b.runner, 0)) result = TRBVH_CANCELLED;
+    trb_runner_stop(&b.runner);
+  }
+  if (result && !b.stats.message[0]) trb_fail(&b, result, trbvh_result_text(result), 0, 0, 0);
+  if (result && options && options->stats) *options->stats = b.stats;
+  return result;
+}
+
+TRBVH_API trbvh_result trbvh_intersect_n(const trbvh *bvh, const trbvh_ray *rays, trbvh_hit *hits, size_t count,
+                                         const trbvh_options *options) {
+  trb_batch batch;
+  batch.bvh = bvh;
+  batch.rays = rays;
+  batch.hits = hits;
+  batch.occluded = NULL;
+  batch.count = count;
+  return trb_run_batch(&batch, options);
+}
+
+TRBVH_API trbvh_result trbvh_occluded_n(const trbvh *bvh, const trbvh_ray *rays, uint8_t *occluded, size_t count,
+                                        const trbvh_options *options) {
+  trb_batch batch;
+  batch.bvh = bvh;
+  batch.rays = rays;
+  batch.hits = NULL;
+  batch.occluded = occluded;
+  batch.count = count;
+  return trb_run_batch(&batch, options);
+}
+
+// >>validate --------------------------------------------------------------------------------------------------------
+TRBVH_API double trbvh_sah(const trbvh *bvh, float cost_node, float cost_prim) {
+  double node_weight = cost_node == 0 ? 1.2 : TRB_MAX(cost_node, 0);
+  double prim_weight = cost_prim == 0 ? 1.0 : TRB_MAX(cost_prim, 0);
+  double sum = 0, root;
+  uint32_t i;
+  if (!bvh || !bvh->node_count) return 0;
+  root = trb_sah_term(&bvh->nodes[0], 1);
+  for (i = 0; i < bvh->node_count; i += i ? 1 : 2) {
+    const trbvh_node *n = &bvh->nodes[i];
+    sum += trb_sah_term(n, n->count ? prim_weight * n->count : node_weight);
+  }
+  return root > 0 ? sum / root : 0;
+}
+
+/* One bit for each pair of siblings, each entry of prims[], each primitive. */
+typedef struct trb_check {
+  const trbvh    *bvh;
+  trbvh_geometry  geometry;
+  unsigned char  *pair_seen, *entry_seen, *prim_seen;
+  char           *why;
+  size_t          why_size;
+} trb_check;
+
+static int trb_mark(unsigned char *bits, uint32_t i) {         /* 1 when seen before */
+  int seen = bits[i >> 3] >> (i & 7) & 1;
+  bits[i >> 3] = (unsigned char)(bits[i >> 3] | 1 << (i & 7));
+  return seen;
+}
+
+static trbvh_result trb_damage(const trb_check *c, const char *format, unsigned a, unsigned b) {
+  if (c->why && c->why_size) snprintf(c->why, c->why_size, format, a, b);
+  return TRBVH_BAD_DATA;
+}
+
+static int trb_inside(const trbvh_node *inner, const trbvh_node *outer) {
+  int k, inside = 1;
+  for (k = 0; k < 3; k++) inside &= inner->min[k] >= outer->min[k] && inner->max[k] <= outer->max[k];
+  return inside;
+}
+
+/* Entry i of a leaf against the mesh. Where triangles were split, a leaf holds a part of each: boxes must overlap. */
+static trbvh_result trb_check_entry(const trb_check *c, const trbvh_node *leaf, uint32_t i, int split) {
+  const trbvh *bvh = c->bvh;
+  uint32_t prim = bvh->prims[i], vertex;
+  trbvh_node box;
+  float v[3][3];
+  int k, overlap = 1;
+  if (trb_prim_box(&c->geometry, prim, &box, v, &vertex) != 1)
+    return trb_damage(c, "prims[%u] is primitive %u, which is invalid", i, prim);
+  if (trb_mark(c->prim_seen, prim) && !split) return trb_damage(c, "primitive %u is in two leaves", prim, 0);
+  for (k = 0; k < 3; k++) overlap &= box.min[k] <= leaf->max[k] && box.max[k] >= leaf->min[k];
+  if (!overlap || (!split && !trb_inside(&box, leaf)))
+    return trb_damage(c, "primitive %u is outside of its leaf, entry %u", prim, i);
+  if (bvh->triangles && !c->geometry.boxes) {
+    const trbvh_triangle *t = &bvh->triangles[i];
+    for (k = 0; k < 3; k++)
+      if (t->v0[k] != v[0][k] || t->e1[k] != v[1][k] - v[0][k] || t->e2[k] != v[2][k] - v[0][k])
+        return trb_damage(c, "triangles[%u] is not triangle %u of the mesh", i, prim);
+  }
+  return TRBVH_OK;
+}
+
+static trbvh_result trb_check_leaf(const trb_check *c, uint32_t index, int split) {
+  const trbvh *bvh = c->bvh;
+  const trbvh_node *leaf = &bvh->nodes[index];
+  uint32_t i, k;
+  trbvh_result result = TRBVH_OK;
+  if (leaf->count > bvh->ref_count || leaf->first > bvh->ref_count - leaf->count)
+    return trb_damage(c, "leaf %u reaches beyond the %u primitives", index, bvh->ref_count);
+  for (i = leaf->first; i < leaf->first + leaf->count && !result; i++) {
+    if (trb_mark(c->entry_seen, i)) return trb_damage(c, "prims[%u] is in two leaves", i, 0);
+    if (bvh->prims[i] >= bvh->prim_count) return trb_damage(c, "prims[%u] is %u, out of range", i, bvh->prims[i]);
+    if (bvh->triangles && bvh->triangles[i].prim != bvh->prims[i])
+      return trb_damage(c, "triangles[%u].prim is not prims[%u]", i, i);
+    for (k = leaf->first; k < i; k++)
+      if (bvh->prims[k] == bvh->prims[i]) return trb_damage(c, "leaf %u holds primitive %u twice", index, bvh->prims[i]);
+    if (c->prim_seen) result = trb_check_entry(c, leaf, i, split);
+  }
+  return result;
+}
+
+static trbvh_result trb_check_tree(const trb_check *c, int split) {
+  const trbvh_node *nodes = c->bvh->nodes;
+  uint32_t stack[TRBVH_MAX_DEPTH], depths[TRBVH_MAX_DEPTH], height = 0, node = 0, depth = 0, visited = 0, entries = 0, k;
+  for (;;) {
+    const uint32_t first = nodes[node].first, count = nodes[node].count;
+    visited++;
+    for (k = 0; k < 3; k++)
+      if (!(nodes[node].min[k] <= nodes[node].max[k])) return trb_damage(c, "node %u has an inverted box", node, 0);
+    if (count == 0) {
+      if (first < 2 || first % 2 || first >= c->bvh->node_count || c->bvh->node_count - first < 2)
+        return trb_damage(c, "node %u has no children at %u", node, first);
+      if (trb_mark(c->pair_seen, first / 2)) return trb_damage(c, "node %u is reached twice", first, 0);
+      if (!trb_inside(&nodes[first], &nodes[node]) || !trb_inside(&nodes[first + 1], &nodes[node]))
+        return trb_damage(c, "a child of node %u, at %u, is outside of it", node, first);
+      if (depth == TRBVH_MAX_DEPTH) return trb_damage(c, "node %u lies deeper than %u", first, TRBVH_MAX_DEPTH);
+      stack[height] = first + 1;
+      depths[height++] = ++depth;
+      node = first;
+    } else {
+      trbvh_result result = trb_check_leaf(c, node, split);
+      if (result) return result;
+      entries += count;
+      if (height == 0) break;
+      node = stack[--height];
+      depth = depths[height];
+    }
+  }
+  if (visited + 1 != c->bvh->node_count)
+    return trb_damage(c, "%u nodes can be reached, %u are there", visited + 1, c->bvh->node_count);
+  if (entries != c->bvh->ref_count) return trb_damage(c, "%u entries of prims[%u] are in leaves", entries, c->bvh->ref_count);
+  return TRBVH_OK;
+}
+
+TRBVH_API trbvh_result trbvh_validate(const trbvh *bvh, const trbvh_geometry *geometry, char *why, size_t why_size) {
+  trb_build b;
+  trb_check c;
+  trbvh_result result = TRBVH_OK;
+  size_t pairs, entries, prims;
+  unsigned char *bits;
+  uint32_t i, valid = 0, vertex;
+  memset(&b, 0, sizeof b);
+  memset(&c, 0, sizeof c);
+  c.bvh = bvh;
+  c.why = why;
+  c.why_size = why_size;
+  if (why && why_size) why[0] = 0;
+  if (!bvh) { trb_damage(&c, "bvh is NULL", 0, 0); return TRBVH_INVALID_ARGUMENT; }
+  if (geometry) {
+    b.geometry = geometry;
+    result = trb_resolve_geometry(&b);
+    if (!result && geometry->count != bvh->prim_count)
+      result = trb_fail(&b, TRBVH_INVALID_ARGUMENT, "the tree is over %u primitives, the geometry has %u",
+                        bvh->prim_count, geometry->count, 0);
+    if (result) { trb_damage(&c, b.stats.message, 0, 0); return result; }
+  }
+  if (bvh->node_count && (bvh->node_count % 2 || !bvh->nodes || !bvh->prims))
+    return trb_damage(&c, "%u nodes, or one of nodes and prims is NULL", bvh->node_count, 0);
+  pairs = bvh->node_count / 16 + 1;
+  entries = bvh->ref_count / 8 + 1;
+  prims = geometry ? bvh->prim_count / 8 + 1 : 0;
+  bits = (unsigned char *)TRBVH_MALLOC(pairs + entries + prims);
+  if (!bits) { trb_damage(&c, "no memory for the check", 0, 0); return TRBVH_OUT_OF_MEMORY; }
+  memset(bits, 0, pairs + entries + prims);
+  c.geometry = b.input;
+  c.pair_seen = bits;
+  c.entry_seen = bits + pairs;
+  c.prim_seen = geometry ? bits + pairs + entries : NULL;
+  for (i = 0; geometry && i < bvh->prim_count; i++) {
+    trbvh_node box;
+    float v[3][3];
+    valid += trb_prim_box(&c.geometry, i, &box, v, &vertex) == 1;
+  }
+  if (bvh->node_count) result = trb_check_tree(&c, bvh->ref_count != valid);
+  for (i = 0; geometry && i < bvh->prim_count && !result; i++) {
+    trbvh_node box;
+    float v[3][3];
+    if (trb_prim_box(&c.geometry, i, &box, v, &vertex) == 1 && !trb_mark(c.prim_seen, i))
+      result = trb_damage(&c, "primitive %u is in no leaf", i, 0);
+  }
+  TRBVH_FREE(bits);
+  return result;
+}
+
+#endif /* !TRBVH_OPENCL_C */
+
+// >>end ---- the user's own code keeps its own floating-point rules and names ----------------------------------------
+#if defined(__clang__)
+  #pragma STDC FP_CONTRACT DEFAULT
+#elif defined(__GNUC__) && !defined(TRBVH_OPENCL_C)
+  #pragma GCC pop_options
+#endif
+#endif /* TRBVH_IMPLEMENTATION */
