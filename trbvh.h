@@ -1056,7 +1056,6 @@ static double trb_ms(void) {
 /* What one block of primitives came to. */
 typedef struct trb_block {
   trbvh_node bounds;                     /* of the references; min > max where there are none */
-  trbvh_node centres;                    /* of their centres */
   uint32_t   start, count;               /* its references */
   uint32_t   split_start;                /* and after splitting */
   uint32_t   skipped, bad, bad_vertex;   /* primitives; the first with an index out of range (TRBVH_NONE: none), and it */
@@ -1267,6 +1266,17 @@ static int trb_load_triangle(const trbvh_geometry *g, uint32_t i, float v[3][3],
   return 1;
 }
 
+/* Asks for what is first needed of one triangle to come, and what it points to of one that comes earlier. */
+static void trb_prefetch_triangle(const trbvh_geometry *g, uint32_t later, uint32_t sooner) {
+  size_t k, corner = (size_t)sooner * 3;
+  if (!g->indices) {
+    TRB_PREFETCH((const char *)g->positions + (size_t)later * 3 * g->position_stride);
+    return;
+  }
+  TRB_PREFETCH((const char *)g->indices + (size_t)later * 3 * g->index_size);
+  for (k = 0; k < 3; k++) TRB_PREFETCH((const char *)g->positions + trb_index(g, corner + k) * g->position_stride);
+}
+
 static trbvh_node trb_no_box(void) {
   trbvh_node n;
   int k;
@@ -1316,13 +1326,13 @@ static void trb_read_job(void *context, uint32_t index) {
   uint32_t i = index * TRB_BLOCK, end = TRB_MIN(g->count, i + TRB_BLOCK);
   trb_block block;
   memset(&block, 0, sizeof block);
-  block.bounds = block.centres = trb_no_box();
+  block.bounds = trb_no_box();
   block.start = i;
   block.bad = TRBVH_NONE;
   for (; i < end; i++) {
     trbvh_node box;
-    float v[3][3], centre[3];
-    int k, valid = trb_prim_box(g, i, &box, v, &block.bad_vertex);
+    float v[3][3];
+    int valid = trb_prim_box(g, i, &box, v, &block.bad_vertex);
     if (valid < 0) {
       block.bad = i;
       break;
@@ -1331,9 +1341,7 @@ static void trb_read_job(void *context, uint32_t index) {
       block.skipped++;
       continue;
     }
-    for (k = 0; k < 3; k++) centre[k] = 0.5f * box.min[k] + 0.5f * box.max[k];
     trb_include(&block.bounds, box.min, box.max);
-    trb_include(&block.centres, centre, centre);
     box.first = i;
     b->unsplit[block.start + block.count++] = box;
   }
@@ -1342,7 +1350,7 @@ static void trb_read_job(void *context, uint32_t index) {
 
 /* All references: what the blocks found, with their gaps closed. Fails for an index out of range. */
 static trbvh_result trb_read(trb_build *b) {
-  trbvh_node bounds = trb_no_box(), centres = trb_no_box();
+  trbvh_node bounds = trb_no_box();
   float extent = 0;
   uint32_t i;
   int k;
@@ -1355,10 +1363,7 @@ static trbvh_result trb_read(trb_build *b) {
                       block->bad_vertex, b->input.position_count);
     b->stats.skipped_count += block->skipped;
     trb_include(&bounds, block->bounds.min, block->bounds.max);
-    trb_include(&centres, block->centres.min, block->centres.max);
   }
-  /* Fragments lie anywhere in the scene, and should be cut where the hierarchy will be. */
-  if (!b->split_max) bounds = centres;
   for (k = 0; k < 3; k++) {
     float side = bounds.max[k] - bounds.min[k];
     b->grid.origin[k] = bounds.min[k];
@@ -1940,72 +1945,71 @@ static trbvh_node trb_bounded_node(trb_build *b, uint32_t i, uint32_t depth, uin
 }
 
 /* The primitives of a leaf, each once; returns how many. */
-static uint32_t trb_leaf_prims(const trb_build *b, uint32_t node, uint32_t prims[TRB_MAX_LEAF]) {
-  uint32_t stack[TRB_MAX_LEAF], waiting = 0, count = 0, i;
-  stack[waiting++] = node;
-  while (waiting) {
-    const trbvh_node *n = &b->nodes[stack[--waiting]];
-    if (trb_count(n->count) > 1) {
-      stack[waiting++] = n->first + 1;
-      stack[waiting++] = n->first;
+static uint32_t trb_leaf_prims(const trb_build *b, const trbvh_node *leaf, uint32_t *prims) {
+  const trbvh_node *stack[TRB_MAX_LEAF];
+  uint32_t waiting = 0, count = 0, i;
+  for (;;) {
+    if (trb_count(leaf->count) > 1) {
+      stack[waiting++] = &b->nodes[leaf->first + 1];
+      leaf = &b->nodes[leaf->first];
       continue;
     }
-    for (i = 0; b->split_max && i < count && prims[i] != n->first; i++) {}
-    if (!b->split_max || i == count) prims[count++] = n->first;
+    for (i = 0; b->split_max && i < count && prims[i] != leaf->first; i++) {}
+    if (!b->split_max || i == count) prims[count++] = leaf->first;
+    if (waiting == 0) return count;
+    leaf = stack[--waiting];
   }
-  return count;
 }
 
-typedef struct trb_visit { uint32_t node, dst, depth; } trb_visit;
+/* An inner node of the walk: where its children stand, the pair number they get in the result, their depth. */
+typedef struct trb_visit { uint32_t first, pair, depth; } trb_visit;
 
 /* First walk, below one task's node: counts. */
 static void trb_count_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
   trb_task *task = &b->tasks[index];
   trb_visit stack[TRBVH_MAX_DEPTH + 1], v;
-  uint32_t waiting = 0, refs = task->first_ref, prims[TRB_MAX_LEAF];
+  uint32_t waiting = 0, prims[TRB_MAX_LEAF], child = task->node, depth = task->depth, last = child;
   task->leaves = task->prims = 0;
-  v.node = task->node;
-  v.depth = task->depth;
   for (;;) {
-    trbvh_node node = trb_bounded_node(b, v.node, v.depth, refs);
-    if (!trb_is_leaf(node.count)) {
-      v.depth++;
-      v.node = node.first + 1;
-      stack[waiting++] = v;
-      v.node = node.first;
-      TRB_PREFETCH(&b->nodes[b->nodes[node.first + 1].first]);
-      continue;
+    for (; child <= last; child++) {
+      const trbvh_node node = trb_bounded_node(b, child, depth, task->first_ref);
+      if (trb_is_leaf(node.count)) {
+        task->leaves++;
+        task->prims += b->split_max ? trb_leaf_prims(b, &node, prims) : trb_count(node.count);
+      } else {
+        TRB_PREFETCH(&b->nodes[node.first]);
+        stack[waiting].first = node.first;
+        stack[waiting++].depth = depth + 1;
+      }
     }
-    task->leaves++;
-    task->prims += b->split_max ? trb_leaf_prims(b, v.node, prims) : trb_count(node.count);
-    refs += trb_count(node.count);
     if (waiting == 0) break;
     v = stack[--waiting];
+    child = v.first;
+    last = child + 1;
+    depth = v.depth;
   }
 }
 
 /* First walk, above the tasks: finds them. */
 static void trb_find_tasks(trb_build *b) {
-  trb_visit stack[TRBVH_MAX_DEPTH + 1], v;
-  uint32_t waiting = 0, refs = 0;
+  uint32_t stack[TRBVH_MAX_DEPTH + 1], depths[TRBVH_MAX_DEPTH + 1], waiting = 0, refs = 0, node = 0, depth = 0;
   b->task_count = 0;
-  v.node = v.depth = 0;
   for (;;) {
-    trbvh_node node = trb_bounded_node(b, v.node, v.depth, refs);
-    if (trb_count(node.count) > TRB_BLOCK) {
-      v.depth++;
-      v.node = node.first + 1;
-      stack[waiting++] = v;
-      v.node = node.first;
+    const trbvh_node n = trb_bounded_node(b, node, depth, refs);
+    if (trb_count(n.count) > TRB_BLOCK) {
+      stack[waiting] = n.first + 1;
+      depths[waiting++] = ++depth;
+      node = n.first;
     } else {
       trb_task *task = &b->tasks[b->task_count++];
-      task->node = v.node;
-      task->depth = v.depth;
+      task->node = node;
+      task->depth = depth;
       task->first_ref = refs;
-      refs += trb_count(node.count);
+      refs += trb_count(n.count);
       if (waiting == 0) break;
-      v = stack[--waiting];
+      node = stack[--waiting];
+      depth = depths[waiting];
     }
   }
 }
@@ -2027,68 +2031,77 @@ static double trb_emit_inner(const trb_build *b, trbvh_node node, uint32_t dst, 
   return trb_sah_term(&node, b->options.cost_node);
 }
 
-/* Second walk, below one task's node: writes. */
+/* Writes a leaf whose primitives begin at `prim`. */
+static double trb_emit_leaf(const trb_build *b, trbvh_node node, uint32_t dst, uint32_t prim) {
+  node.count = trb_leaf_prims(b, &node, (uint32_t *)(uintptr_t)b->tree.prims + prim);
+  node.first = prim;
+  *trb_out(b, dst) = node;
+  return trb_sah_term(&node, (double)b->options.cost_prim * node.count);
+}
+
+/* Second walk, below one task's node: writes. The children of siblings get neighbouring pairs. */
 static void trb_emit_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
   trb_task *task = &b->tasks[index];
-  uint32_t *out = (uint32_t *)(uintptr_t)b->tree.prims;
-  uint32_t waiting = 0, pair = task->pair, prim = task->first_prim, prims[TRB_MAX_LEAF];
+  uint32_t waiting = 0, pair = task->pair, prim = task->first_prim;
+  uint32_t child = task->node, last = child, dst = task->dst, depth = task->depth, deepest = 0;
   trb_visit stack[TRBVH_MAX_DEPTH + 1], v;
-  v.node = task->node;
-  v.dst = task->dst;
-  v.depth = task->depth;
   task->sah = 0;
-  task->max_depth = 0;
   for (;;) {
-    trbvh_node node = b->nodes[v.node];
-    if (!trb_is_leaf(node.count)) {
-      task->sah += trb_emit_inner(b, node, v.dst, pair);
-      v.depth++;
-      v.dst = 2 * pair + 1;
-      v.node = node.first + 1;
-      stack[waiting++] = v;
-      v.dst = 2 * pair++;
-      v.node = node.first;
-      TRB_PREFETCH(&b->nodes[b->nodes[node.first + 1].first]);
-      continue;
+    uint32_t inner = waiting;
+    for (; child <= last; child++, dst++) {
+      const trbvh_node node = b->nodes[child];
+      if (trb_is_leaf(node.count)) {
+        task->sah += trb_emit_leaf(b, node, dst, prim);
+        prim += trb_out(b, dst)->count;
+        deepest = TRB_MAX(depth, deepest);
+      } else {
+        TRB_PREFETCH(&b->nodes[node.first]);
+        task->sah += trb_emit_inner(b, node, dst, pair);
+        stack[waiting].first = node.first;
+        stack[waiting].pair = pair++;
+        stack[waiting++].depth = depth + 1;
+      }
     }
-    node.count = trb_leaf_prims(b, v.node, prims);
-    node.first = prim;
-    memcpy(out + prim, prims, node.count * sizeof *out);
-    *trb_out(b, v.dst) = node;
-    task->sah += trb_sah_term(&node, (double)b->options.cost_prim * node.count);
-    task->max_depth = TRB_MAX(v.depth, task->max_depth);
-    prim += node.count;
-    if (waiting == 0) break;
-    v = stack[--waiting];
+    if (waiting == inner + 2) {                      /* the left one first */
+      v = stack[inner];
+      stack[inner] = stack[inner + 1];
+      waiting--;
+    } else {
+      if (waiting == 0) break;
+      v = stack[--waiting];
+    }
+    child = v.first;
+    last = child + 1;
+    dst = 2 * v.pair;
+    depth = v.depth;
   }
+  task->max_depth = deepest;
   TRBVH_ASSERT(pair - task->pair == task->leaves - 1 && prim - task->first_prim == task->prims);
 }
 
 /* Second walk, above the tasks: writes, and tells them their places. The sum of equation 1 of what it wrote. */
 static double trb_emit_top(trb_build *b) {
-  trb_visit stack[TRBVH_MAX_DEPTH + 1], v;
-  uint32_t waiting = 0, pair = 1, prim = 0;
+  uint32_t stack[TRBVH_MAX_DEPTH + 1], dsts[TRBVH_MAX_DEPTH + 1], waiting = 0, pair = 1, prim = 0, node = 0, dst = 0;
   trb_task *task = b->tasks;
   double sah = 0;
-  v.node = v.dst = v.depth = 0;
   for (;;) {
-    trbvh_node node = b->nodes[v.node];
-    if (trb_count(node.count) > TRB_BLOCK) {
-      sah += trb_emit_inner(b, node, v.dst, pair);
-      v.dst = 2 * pair + 1;
-      v.node = node.first + 1;
-      stack[waiting++] = v;
-      v.dst = 2 * pair++;
-      v.node = node.first;
+    const trbvh_node n = b->nodes[node];
+    if (trb_count(n.count) > TRB_BLOCK) {
+      sah += trb_emit_inner(b, n, dst, pair);
+      stack[waiting] = n.first + 1;
+      dsts[waiting++] = 2 * pair + 1;
+      node = n.first;
+      dst = 2 * pair++;
     } else {
-      task->dst = v.dst;
+      task->dst = dst;
       task->pair = pair;
       task->first_prim = prim;
       pair += task->leaves - 1;
       prim += task++->prims;
       if (waiting == 0) return sah;
-      v = stack[--waiting];
+      node = stack[--waiting];
+      dst = dsts[waiting];
     }
   }
 }
@@ -2156,6 +2169,7 @@ static void trb_triangle_job(void *context, uint32_t index) {
   for (; i < end; i++) {
     float v[3][3];
     int k;
+    if (i + 2 * TRB_AHEAD < end) trb_prefetch_triangle(&b->input, prims[i + 2 * TRB_AHEAD], prims[i + TRB_AHEAD]);
     trb_load_triangle(&b->input, prims[i], v, &vertex);
     for (k = 0; k < 3; k++) {
       out[i].v0[k] = v[0][k];
