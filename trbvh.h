@@ -802,8 +802,24 @@ TRBVH_API const char *trbvh_result_text(trbvh_result result) {
 
 // >>memory ----------------------------------------------------------------------------------------------------------
 #ifndef TRBVH_MALLOC
-  #define TRBVH_MALLOC(size) malloc(size)
+  #define TRBVH_MALLOC(size) trb_malloc(size)
   #define TRBVH_FREE(pointer) free(pointer)
+  #if defined(__linux__)
+    #include <sys/mman.h>
+  #endif
+
+/* malloc, with large pages for large blocks where the system hands them out on request: touching fresh memory in
+ * small ones takes half of a FAST build's time. */
+static void *trb_malloc(size_t size) {
+  char *p = (char *)malloc(size);
+  #ifdef MADV_HUGEPAGE                   /* not under -std=c99 */
+  if (p && size >= 1u << 22) {
+    size_t skip = (4096 - ((uintptr_t)p & 4095)) & 4095;
+    madvise(p + skip, (size - skip) & ~(size_t)4095, MADV_HUGEPAGE);
+  }
+  #endif
+  return p;
+}
 #endif
 #ifndef TRBVH_ASSERT
   #define TRBVH_ASSERT(x) ((void)0)
@@ -1050,7 +1066,7 @@ static double trb_ms(void) {
 #define TRB_BLOCK         16384u         /* primitives, references or leaves a job works on: their nodes fit a cache */
 #define TRB_OPEN_MAX      200u           /* subtrees of a block that its neighbours complete: 2 (63 + 32) + 1 at most */
 #define TRB_SPLIT_STACK   64u            /* fragments of one triangle that wait to be split */
-#define TRB_AHEAD         16u            /* how far ahead random reads are asked for */
+#define TRB_AHEAD         32u            /* how far ahead random reads are asked for */
 #define TRB_NODE_BYTES    sizeof(trbvh_node)
 
 /* What one block of primitives came to. */
@@ -1266,17 +1282,6 @@ static int trb_load_triangle(const trbvh_geometry *g, uint32_t i, float v[3][3],
   return 1;
 }
 
-/* Asks for what is first needed of one triangle to come, and what it points to of one that comes earlier. */
-static void trb_prefetch_triangle(const trbvh_geometry *g, uint32_t later, uint32_t sooner) {
-  size_t k, corner = (size_t)sooner * 3;
-  if (!g->indices) {
-    TRB_PREFETCH((const char *)g->positions + (size_t)later * 3 * g->position_stride);
-    return;
-  }
-  TRB_PREFETCH((const char *)g->indices + (size_t)later * 3 * g->index_size);
-  for (k = 0; k < 3; k++) TRB_PREFETCH((const char *)g->positions + trb_index(g, corner + k) * g->position_stride);
-}
-
 static trbvh_node trb_no_box(void) {
   trbvh_node n;
   int k;
@@ -1296,11 +1301,13 @@ static void trb_include(trbvh_node *n, const float low[3], const float high[3]) 
 /* 0 for a triangle with a NaN or infinity. */
 static int trb_triangle_box(const float v[3][3], trbvh_node *box) {
   int k, finite = 1;
-  *box = trb_no_box();
   for (k = 0; k < 3; k++) {
-    finite &= trb_finite(v[k][0]) & trb_finite(v[k][1]) & trb_finite(v[k][2]);
-    trb_include(box, v[k], v[k]);
+    float low = TRB_MIN(v[0][k], v[1][k]), high = TRB_MAX(v[0][k], v[1][k]);
+    box->min[k] = TRB_MIN(v[2][k], low);
+    box->max[k] = TRB_MAX(v[2][k], high);
+    finite &= trb_finite(v[0][k]) & trb_finite(v[1][k]) & trb_finite(v[2][k]);
   }
+  box->first = box->count = 0;
   return finite;
 }
 
@@ -1771,29 +1778,39 @@ static float trb_present_cost(trb_treelets *t, uint32_t lane, trb_costs costs) {
   return cost[0];
 }
 
-/* Gives the root of a treelet the best topology. */
+/* The six pairs a treelet may use, last one first. */
+static void trb_sort_pairs(const trb_treelets *t, uint32_t lane, uint32_t pairs[TRB_TREELET - 1]) {
+  uint32_t i, k;
+  for (i = 0; i < TRB_TREELET - 1; i++) {
+    uint32_t pair = t->pair[i][lane];
+    for (k = i; k > 0 && pairs[k - 1] < pair; k--) pairs[k] = pairs[k - 1];
+    pairs[k] = pair;
+  }
+}
+
+/* Gives the root of a treelet the best topology. Nodes are laid out as the hierarchy does it, children before parents
+ * and left before right, which is the order that the collapse walks through backwards. */
 static void trb_rebuild_treelet(trbvh_node *nodes, const trb_treelets *t, uint32_t lane, uint32_t root, trb_costs costs) {
   trbvh_node leaf[TRB_TREELET];
-  uint32_t subset[TRB_TREELET - 1], node[TRB_TREELET - 1], count = 1, i, side;
+  uint32_t pairs[TRB_TREELET - 1], node[TRB_TREELET - 1], i, side, waiting = 0;
+  uint32_t stack_node[TRB_TREELET], stack_subset[TRB_TREELET];
   for (i = 0; i < TRB_TREELET; i++) leaf[i] = nodes[t->slot[i][lane]];
-  subset[0] = TRB_SUBSETS - 1;
-  node[0] = root;
-  for (i = 0; i < TRB_TREELET - 1; i++) {            /* inner nodes from the root down, their children at pair i */
-    uint32_t part = trb_partition(t->table + lane, subset[i]);
-    for (side = 0; side < 2; side++, part ^= subset[i]) {
-      uint32_t child = t->pair[i][lane] + side;
+  trb_sort_pairs(t, lane, pairs);
+  stack_node[waiting] = root;
+  stack_subset[waiting++] = TRB_SUBSETS - 1;
+  for (i = 0; waiting; i++) {                        /* inner nodes from the root down, their children at pairs[i] */
+    uint32_t subset = stack_subset[--waiting], part = trb_partition(t->table + lane, subset);
+    node[i] = stack_node[waiting];
+    for (side = 0; side < 2; side++, part ^= subset) {
       if (TRB_SINGLE(part)) {
-        nodes[child] = leaf[trb_log2(part)];
+        nodes[pairs[i] + side] = leaf[trb_log2(part)];
       } else {
-        subset[count] = part;
-        node[count++] = child;
+        stack_node[waiting] = pairs[i] + side;
+        stack_subset[waiting++] = part;
       }
     }
   }
-  while (i--) {
-    uint32_t pair = t->pair[i][lane];
-    nodes[node[i]] = trb_parent(nodes[pair], nodes[pair + 1], pair, costs);
-  }
+  while (i--) nodes[node[i]] = trb_parent(nodes[pairs[i]], nodes[pairs[i] + 1], pairs[i], costs);
 }
 
 /* Up to TRB_LANES roots, none above another. */
@@ -1884,9 +1901,10 @@ static int trb_round(trb_build *b, uint32_t gamma) {
 
 // >>collapse ---- subtrees that are cheaper as leaves become leaves, and the tree moves into its final layout --------
 /* Every small node knows already whether it is better as a leaf (equation 2, trb_parent); the topmost such nodes
- * become leaves. Two walks from the root down, in the same order, left before right: the first counts leaves and
- * primitives, the second writes; in between, the result is allocated and prefix sums tell every job its place. Nodes
- * lie in depth-first order, primitives in the order of their leaves.
+ * become leaves. Two walks from the root down, in the same order: the first counts leaves and
+ * primitives, the second writes; in between, the result is allocated and prefix sums tell every job its place. Right
+ * before left, because the hierarchy laid children before parents: both walks then run through memory backwards, one
+ * line after the other.
  *
  * The depth bound: a node at depth d with n references can always be made a balanced subtree that ends at depth
  * d + ceil(log2 n). Where a child could no longer be made so within TRBVH_MAX_DEPTH, its parent still can, and is. As
@@ -1950,8 +1968,8 @@ static uint32_t trb_leaf_prims(const trb_build *b, const trbvh_node *leaf, uint3
   uint32_t waiting = 0, count = 0, i;
   for (;;) {
     if (trb_count(leaf->count) > 1) {
-      stack[waiting++] = &b->nodes[leaf->first + 1];
-      leaf = &b->nodes[leaf->first];
+      stack[waiting++] = &b->nodes[leaf->first];
+      leaf = &b->nodes[leaf->first + 1];
       continue;
     }
     for (i = 0; b->split_max && i < count && prims[i] != leaf->first; i++) {}
@@ -1969,25 +1987,25 @@ static void trb_count_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
   trb_task *task = &b->tasks[index];
   trb_visit stack[TRBVH_MAX_DEPTH + 1], v;
-  uint32_t waiting = 0, prims[TRB_MAX_LEAF], child = task->node, depth = task->depth, last = child;
+  uint32_t waiting = 0, prims[TRB_MAX_LEAF], child = task->node, siblings = 1;
+  v.depth = task->depth;
   task->leaves = task->prims = 0;
   for (;;) {
-    for (; child <= last; child++) {
-      const trbvh_node node = trb_bounded_node(b, child, depth, task->first_ref);
+    for (; siblings; siblings--, child++) {
+      const trbvh_node node = trb_bounded_node(b, child, v.depth, task->first_ref);
       if (trb_is_leaf(node.count)) {
         task->leaves++;
         task->prims += b->split_max ? trb_leaf_prims(b, &node, prims) : trb_count(node.count);
       } else {
         TRB_PREFETCH(&b->nodes[node.first]);
         stack[waiting].first = node.first;
-        stack[waiting++].depth = depth + 1;
+        stack[waiting++].depth = v.depth + 1;
       }
     }
-    if (waiting == 0) break;
+    if (waiting == 0) return;
     v = stack[--waiting];
     child = v.first;
-    last = child + 1;
-    depth = v.depth;
+    siblings = 2;
   }
 }
 
@@ -2043,40 +2061,32 @@ static double trb_emit_leaf(const trb_build *b, trbvh_node node, uint32_t dst, u
 static void trb_emit_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
   trb_task *task = &b->tasks[index];
-  uint32_t waiting = 0, pair = task->pair, prim = task->first_prim;
-  uint32_t child = task->node, last = child, dst = task->dst, depth = task->depth, deepest = 0;
+  uint32_t waiting = 0, pair = task->pair, prim = task->first_prim, child = task->node, dst = task->dst, siblings = 1;
   trb_visit stack[TRBVH_MAX_DEPTH + 1], v;
+  v.depth = task->depth;
   task->sah = 0;
+  task->max_depth = 0;
   for (;;) {
-    uint32_t inner = waiting;
-    for (; child <= last; child++, dst++) {
+    for (; siblings; siblings--, child++, dst++) {
       const trbvh_node node = b->nodes[child];
       if (trb_is_leaf(node.count)) {
         task->sah += trb_emit_leaf(b, node, dst, prim);
         prim += trb_out(b, dst)->count;
-        deepest = TRB_MAX(depth, deepest);
+        task->max_depth = TRB_MAX(v.depth, task->max_depth);
       } else {
-        TRB_PREFETCH(&b->nodes[node.first]);
         task->sah += trb_emit_inner(b, node, dst, pair);
+        TRB_PREFETCH(&b->nodes[node.first]);
         stack[waiting].first = node.first;
         stack[waiting].pair = pair++;
-        stack[waiting++].depth = depth + 1;
+        stack[waiting++].depth = v.depth + 1;
       }
     }
-    if (waiting == inner + 2) {                      /* the left one first */
-      v = stack[inner];
-      stack[inner] = stack[inner + 1];
-      waiting--;
-    } else {
-      if (waiting == 0) break;
-      v = stack[--waiting];
-    }
+    if (waiting == 0) break;
+    v = stack[--waiting];
     child = v.first;
-    last = child + 1;
     dst = 2 * v.pair;
-    depth = v.depth;
+    siblings = 2;
   }
-  task->max_depth = deepest;
   TRBVH_ASSERT(pair - task->pair == task->leaves - 1 && prim - task->first_prim == task->prims);
 }
 
@@ -2169,7 +2179,6 @@ static void trb_triangle_job(void *context, uint32_t index) {
   for (; i < end; i++) {
     float v[3][3];
     int k;
-    if (i + 2 * TRB_AHEAD < end) trb_prefetch_triangle(&b->input, prims[i + 2 * TRB_AHEAD], prims[i + TRB_AHEAD]);
     trb_load_triangle(&b->input, prims[i], v, &vertex);
     for (k = 0; k < 3; k++) {
       out[i].v0[k] = v[0][k];
