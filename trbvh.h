@@ -658,21 +658,38 @@ TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {
 // ---- Ray tests ----
 /* A ray made ready for many tests. For boxes (Kay and Kajiya): which corner is nearer on each axis, and 1 / dir, with
  * infinities for zeros. For triangles (Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection", JCGT 2013): the
- * axis along which the ray is longest, now called z, and the shear that makes it the z axis. */
+ * axis along which the ray is longest, now called z, and the shear that makes it the z axis.
+ *
+ * Two bounds of rounding errors make hits independent of the tree. Corners seen from the ray, and with them edges,
+ * are off by no more than 12 units of rounding (TRB_UNIT, 2^-24) of their distances: trb_hit_triangle takes a miss by
+ * less for a hit, so that no ray slips through an edge whose triangles round it differently. And no such hit, nor its
+ * distance, is further than 64 units of the scene's extent as seen from the origin outside of the boxes above it:
+ * boxes are tested from origins moved by that much, forth for near corners, back for far ones, at no cost. */
+#define TRB_UNIT 5.9604645e-8f
 typedef struct trb_ray {
   float origin[3], inverse[3], tmin, tmax;
+  float near_origin[3], far_origin[3];
   float shear[3];
   int   near_corner[3], far_corner[3], axis[3];
 } trb_ray;
 
-/* 0 for a ray that can hit nothing: one with a NaN or infinity, or without a direction. */
-TRB_CORE int trb_prepare_ray(trb_ray *r, const TRB_GLOBAL trbvh_ray *ray) {
-  float x = trb_abs(ray->dir[0]), y = trb_abs(ray->dir[1]), z = trb_abs(ray->dir[2]);
+/* Boxes are read as eight floats: min at 0, max at 4. 0 for a ray that can hit nothing: one with a NaN or infinity, or
+ * without a direction. */
+TRB_CORE int trb_prepare_ray(trb_ray *r, const TRB_GLOBAL trbvh_ray *ray, const TRB_GLOBAL float *scene) {
+  float x = trb_abs(ray->dir[0]), y = trb_abs(ray->dir[1]), z = trb_abs(ray->dir[2]), extent = 0;
   int k, finite = 1;
   for (k = 0; k < 3; k++) {
+    float low = trb_abs(scene[k] - ray->origin[k]), high = trb_abs(scene[k + 4] - ray->origin[k]);
+    low = TRB_MAX(low, high);
+    extent = TRB_MAX(low, extent);
+  }
+  for (k = 0; k < 3; k++) {
     int negative = (int)(trb_bits(ray->dir[k]) >> 31);
+    float pad = (negative ? -64.0f : 64.0f) * TRB_UNIT * extent;
     finite &= trb_finite(ray->origin[k]) & trb_finite(ray->dir[k]);
     r->origin[k] = ray->origin[k];
+    r->near_origin[k] = ray->origin[k] + pad;
+    r->far_origin[k] = ray->origin[k] - pad;
     r->inverse[k] = ray->dir[k] != 0 ? 1.0f / ray->dir[k] : trb_float(negative ? 0xFF800000u : 0x7F800000u);
     r->near_corner[k] = negative ? k + 4 : k;
     r->far_corner[k] = negative ? k : k + 4;
@@ -688,46 +705,46 @@ TRB_CORE int trb_prepare_ray(trb_ray *r, const TRB_GLOBAL trbvh_ray *ray) {
   return finite && x + y + z > 0 && ray->tmin == ray->tmin && ray->tmax == ray->tmax && r->tmin < r->tmax;
 }
 
-/* Where the ray enters the box, if it meets it between tmin and limit; else a negative number.
- * Conservative: a distance is off by 2^-22 at most, so the far side is put 2^-20 further (Ize, "Robust BVH Ray
- * Traversal", JCGT 2013). A ray inside a face's plane gives 0 * infinity, NaN, which neither comparison takes: such a
- * ray is inside that slab. Boxes are read as eight floats: min at 0, max at 4. */
-#define TRB_FAR_SLACK 1.00000095f
+/* Where the ray enters the box, if it meets it between tmin and limit; else a negative number. A ray inside a face's
+ * plane may give 0 * infinity, NaN, which neither comparison takes: such a ray is inside that slab. */
 TRB_CORE float trb_hit_box(const TRB_GLOBAL float *box, const trb_ray *r, float limit) {
-  float near0 = (box[r->near_corner[0]] - r->origin[0]) * r->inverse[0];
-  float near1 = (box[r->near_corner[1]] - r->origin[1]) * r->inverse[1];
-  float near2 = (box[r->near_corner[2]] - r->origin[2]) * r->inverse[2];
-  float far0 = (box[r->far_corner[0]] - r->origin[0]) * r->inverse[0];
-  float far1 = (box[r->far_corner[1]] - r->origin[1]) * r->inverse[1];
-  float far2 = (box[r->far_corner[2]] - r->origin[2]) * r->inverse[2];
+  float near0 = (box[r->near_corner[0]] - r->near_origin[0]) * r->inverse[0];
+  float near1 = (box[r->near_corner[1]] - r->near_origin[1]) * r->inverse[1];
+  float near2 = (box[r->near_corner[2]] - r->near_origin[2]) * r->inverse[2];
+  float far0 = (box[r->far_corner[0]] - r->far_origin[0]) * r->inverse[0];
+  float far1 = (box[r->far_corner[1]] - r->far_origin[1]) * r->inverse[1];
+  float far2 = (box[r->far_corner[2]] - r->far_origin[2]) * r->inverse[2];
   float enter = r->tmin, leave = limit;
   enter = TRB_MAX(near0, enter); leave = TRB_MIN(far0, leave);
   enter = TRB_MAX(near1, enter); leave = TRB_MIN(far1, leave);
   enter = TRB_MAX(near2, enter); leave = TRB_MIN(far2, leave);
-  return enter <= leave * TRB_FAR_SLACK ? enter : -1.0f;
+  return enter <= leave ? enter : -1.0f;
 }
 
 /* Does the ray hit the triangle at tmin < t <= tmax? t, u, v go to hit, the rest of which stays.
- * u, v, w are edge functions of the corners as the ray sees them, twice the areas opposite of them. The corners come
- * from v0 and two rounded edges, so that neighbours may see a shared edge a rounding error apart: a miss by less than
- * `tolerance`, an upper bound of these errors (8 units of rounding), is a hit, and no ray slips through. A triangle
- * seen so much from the side that its area is below that is left to its neighbours. */
+ * u, v, w are the edge functions opposite to v0, v1, v2: twice the area of edge and ray, seen along the ray. Two
+ * triangles that share an edge compute the same value for it, with the sign that their side has, as long as they get
+ * its ends from the same numbers. Where v0 + e1 or v0 + e2 is not the corner that the mesh has, an edge may be off at
+ * both ends, by `off`, which changes its function by that times the ends' distances from the ray: a miss by less is a
+ * hit then, so that no ray slips through. */
 TRB_CORE int trb_hit_triangle(const TRB_GLOBAL trbvh_triangle *t, const trb_ray *r, float tmax, trbvh_hit *hit) {
   const int kx = r->axis[0], ky = r->axis[1], kz = r->axis[2];
-  float az = t->v0[kz] - r->origin[kz], bz = az + t->e1[kz], cz = az + t->e2[kz];
-  float ax0 = t->v0[kx] - r->origin[kx], ay0 = t->v0[ky] - r->origin[ky];
-  float ax = ax0 - r->shear[0] * az, bx = ax0 + t->e1[kx] - r->shear[0] * bz, cx = ax0 + t->e2[kx] - r->shear[0] * cz;
-  float ay = ay0 - r->shear[1] * az, by = ay0 + t->e1[ky] - r->shear[1] * bz, cy = ay0 + t->e2[ky] - r->shear[1] * cz;
+  float az = t->v0[kz] - r->origin[kz], bz = t->v0[kz] + t->e1[kz] - r->origin[kz], cz = t->v0[kz] + t->e2[kz] - r->origin[kz];
+  float ax = t->v0[kx] - r->origin[kx] - r->shear[0] * az, ay = t->v0[ky] - r->origin[ky] - r->shear[1] * az;
+  float bx = t->v0[kx] + t->e1[kx] - r->origin[kx] - r->shear[0] * bz, by = t->v0[ky] + t->e1[ky] - r->origin[ky] - r->shear[1] * bz;
+  float cx = t->v0[kx] + t->e2[kx] - r->origin[kx] - r->shear[0] * cz, cy = t->v0[ky] + t->e2[ky] - r->origin[ky] - r->shear[1] * cz;
   float u = cx * by - cy * bx, v = ax * cy - ay * cx, w = bx * ay - by * ax;
   float area = u + v + w, inverse, distance;
-  float extent = trb_abs(ax) + trb_abs(bx) + trb_abs(cx) + trb_abs(ay) + trb_abs(by) + trb_abs(cy);
-  float depth = trb_abs(az) + trb_abs(bz) + trb_abs(cz);
-  float tolerance = (extent + depth) * extent * 4.7683716e-7f;
-  if (area < 0) { u = -u; v = -v; w = -w; area = -area; }
-  if (!(u >= -tolerance && v >= -tolerance && w >= -tolerance && area > 0.25f * tolerance)) return 0;
-  u = TRB_MAX(u, 0.0f);
-  v = TRB_MAX(v, 0.0f);
-  w = TRB_MAX(w, 0.0f);
+  if (area < 0) { u = -u; v = -v; w = -w; }
+  if (t->reserved0) {
+    float a = trb_abs(ax) + trb_abs(ay), b = trb_abs(bx) + trb_abs(by), c = trb_abs(cx) + trb_abs(cy);
+    float off = 8.0f * TRB_UNIT * (a + b + c + trb_abs(az) + trb_abs(bz) + trb_abs(cz));
+    if (trb_abs(area) <= 0.25f * off * (a + b + c)) return 0;  /* seen from the side: left to its neighbours */
+    u = u < 0 && u >= -off * (b + c) ? 0 : u;
+    v = v < 0 && v >= -off * (a + c) ? 0 : v;
+    w = w < 0 && w >= -off * (a + b) ? 0 : w;
+  }
+  if (!(u >= 0 && v >= 0 && w >= 0 && area != 0)) return 0;
   inverse = 1.0f / (u + v + w);
   u *= inverse;
   v *= inverse;
@@ -782,7 +799,7 @@ TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbv
     do {
       if (height == 0) return hit->prim != TRBVH_NONE;
       node = stack_node[--height];
-    } while (stack_near[height] > hit->t * TRB_FAR_SLACK);
+    } while (stack_near[height] > hit->t);
   }
 }
 
@@ -2178,15 +2195,18 @@ static void trb_triangle_job(void *context, uint32_t index) {
   trbvh_triangle *out = (trbvh_triangle *)(uintptr_t)b->tree.triangles;
   for (; i < end; i++) {
     float v[3][3];
+    uint32_t inexact = 0;
     int k;
     trb_load_triangle(&b->input, prims[i], v, &vertex);
     for (k = 0; k < 3; k++) {
       out[i].v0[k] = v[0][k];
       out[i].e1[k] = v[1][k] - v[0][k];
       out[i].e2[k] = v[2][k] - v[0][k];
+      inexact |= v[0][k] + out[i].e1[k] != v[1][k] || v[0][k] + out[i].e2[k] != v[2][k];
     }
     out[i].prim = prims[i];
-    out[i].reserved0 = out[i].reserved1 = 0;
+    out[i].reserved0 = inexact;
+    out[i].reserved1 = 0;
   }
 }
 
@@ -2277,14 +2297,15 @@ TRBVH_API trbvh_result trbvh_build(trbvh *bvh, const trbvh_geometry *geometry, c
 
 // >>query -----------------------------------------------------------------------------------------------------------
 static int trb_query(const trbvh *bvh, const trbvh_ray *ray, int any, trbvh_hit *hit) {
+  static const trbvh_node nothing = {{0, 0, 0}, 0, {0, 0, 0}, 0};
+  const trbvh_node *nodes = bvh->node_count ? bvh->nodes : &nothing;
   trb_ray r;
-  if (!trb_prepare_ray(&r, ray) || !bvh->triangles) {
-    hit->t = r.tmax;
-    hit->u = hit->v = 0;
-    hit->prim = hit->instance = TRBVH_NONE;
-    return 0;
-  }
-  return any ? trb_trace(bvh->nodes, bvh->triangles, &r, 1, hit) : trb_trace(bvh->nodes, bvh->triangles, &r, 0, hit);
+  if (trb_prepare_ray(&r, ray, nodes->min) && bvh->triangles)
+    return any ? trb_trace(nodes, bvh->triangles, &r, 1, hit) : trb_trace(nodes, bvh->triangles, &r, 0, hit);
+  hit->t = r.tmax;
+  hit->u = hit->v = 0;
+  hit->prim = hit->instance = TRBVH_NONE;
+  return 0;
 }
 
 TRBVH_API int trbvh_intersect(const trbvh *bvh, const trbvh_ray *ray, trbvh_hit *hit) {
