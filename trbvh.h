@@ -102,7 +102,7 @@ typedef struct trbvh_triangle {
 } trbvh_triangle;
 
 /* 32 bytes. Hits count where tmin < t <= tmax, t in lengths of dir, which need not be unit. tmax 0 = no limit, a
- * negative tmin counts as 0. A ray with a NaN, or without a direction, hits nothing. */
+ * negative tmin counts as 0. A ray with a NaN or infinity, or without a direction, hits nothing. */
 typedef struct trbvh_ray { float origin[3]; float tmin; float dir[3]; float tmax; } trbvh_ray;
 
 /* 20 bytes. Point hit = (1 - u - v) v0 + u v1 + v v2; u, v >= 0, u + v <= 1 within rounding. On a miss prim is
@@ -319,7 +319,7 @@ TRB_CORE float trb_reciprocal(float x) {
 TRB_CORE float trb_cube_root(float x) {
   float r;
   int i;
-  if (!(x > 1e-30f)) return 0;
+  if (!(x > 1e-30f)) return 0;                       /* as good as 0; the bits of smaller ones tell nothing */
   r = trb_float(0x54A21D2Au - trb_bits(x) / 3);
   for (i = 0; i < 4; i++) r = r * (4.0f - x * r * r * r) * 0.333333343f;
   return x * r * r;
@@ -541,6 +541,7 @@ TRB_CORE int trb_improves(float cost, float old_cost) { return cost < old_cost -
  * is left of it after infinitely many splits, and i the level of the most important spatial median plane that cuts
  * the box (-1 for the scene's middle, -2 for the quarters, ...). */
 typedef struct trb_plane { int axis, level; float position; } trb_plane;
+#define TRB_TINY 1e-30f                              /* nothing is cut any smaller, nor closer to a corner */
 
 TRB_CORE trb_plane trb_median_plane(trbvh_node box, trb_grid grid) {
   trb_plane plane;
@@ -570,31 +571,36 @@ TRB_CORE float trb_split_priority(const float v[3][3], trbvh_node box, trb_grid 
   return empty > 0 && empty < FLT_MAX ? trb_cube_root(weight * empty) : 0;
 }
 
+TRB_CORE float trb_longest_side(trbvh_node box) {
+  float x = box.max[0] - box.min[0], y = box.max[1] - box.min[1], z = box.max[2] - box.min[2], xy = TRB_MAX(x, y);
+  return TRB_MAX(xy, z);
+}
+
+TRB_CORE int trb_cuts(trbvh_node box, trb_plane plane) {
+  const int k = plane.axis;
+  return plane.position > box.min[k] && plane.position < box.max[k] && box.max[k] - box.min[k] > TRB_TINY;
+}
+
 /* Where to cut box in two: at the median plane, or the middle of its longest side where that plane only touches it.
- * 0 where there is nothing between the faces. */
+ * 0 where there is nothing between the faces, or where arithmetic would leave the range of float. */
 TRB_CORE int trb_choose_plane(trbvh_node box, trb_grid grid, trb_plane *plane) {
-  float x = box.max[0] - box.min[0], y = box.max[1] - box.min[1], z = box.max[2] - box.min[2];
+  const float longest = trb_longest_side(box);
   int k;
   *plane = trb_median_plane(box, grid);
-  k = plane->axis;
-  if (plane->level > -TRB_GRID_BITS - 1 && plane->position > box.min[k] && plane->position < box.max[k]) return 1;
-  k = x >= y ? (x >= z ? 0 : 2) : (y >= z ? 1 : 2);
+  if (!(longest > TRB_TINY && longest < 1 / TRB_TINY)) return 0;
+  if (plane->level > -TRB_GRID_BITS - 1 && trb_cuts(box, *plane)) return 1;
+  for (k = 0; box.max[k] - box.min[k] < longest; k++) {}
   plane->axis = k;
   plane->position = 0.5f * box.min[k] + 0.5f * box.max[k];
-  return plane->position > box.min[k] && plane->position < box.max[k];
+  return trb_cuts(box, *plane);
 }
 
 /* The share of `splits` for the half whose longest side is `left`, rounded. */
 TRB_CORE trbvh_u32 trb_share(trbvh_u32 splits, float left, float right) {
   float both = left + right;
-  float share = both > 1e-30f && both < 1e30f ? left * trb_reciprocal(both) : 0.5f;
+  float share = both > TRB_TINY && both < 1 / TRB_TINY ? left * trb_reciprocal(both) : 0.5f;
   trbvh_u32 n = (trbvh_u32)((float)splits * share + 0.5f);
   return TRB_MIN(n, splits);
-}
-
-TRB_CORE float trb_longest_side(trbvh_node box) {
-  float x = box.max[0] - box.min[0], y = box.max[1] - box.min[1], z = box.max[2] - box.min[2], xy = TRB_MAX(x, y);
-  return TRB_MAX(xy, z);
 }
 
 /* Cuts the polygon of n corners at position on axis k and keeps the side above (sign 1) or below (-1). */
@@ -605,11 +611,11 @@ TRB_CORE int trb_cut(float polygon[TRB_POLYGON][3], int n, int k, float position
   for (i = 0; i < n; i++) {
     int next = i + 1 < n ? i + 1 : 0;
     float a = (polygon[i][k] - position) * sign, b = (polygon[next][k] - position) * sign;
-    if (a >= 0 && count < TRB_POLYGON) {
+    if (a >= -TRB_TINY && count < TRB_POLYGON) {
       for (j = 0; j < 3; j++) kept[count][j] = polygon[i][j];
       count++;
     }
-    if (((a > 0 && b < 0) || (a < 0 && b > 0)) && count < TRB_POLYGON) {
+    if (((a > 0 && b < -TRB_TINY) || (a < -TRB_TINY && b > 0)) && count < TRB_POLYGON) {
       float t = trb_abs(a) * trb_reciprocal(trb_abs(a) + trb_abs(b));
       for (j = 0; j < 3; j++) kept[count][j] = polygon[i][j] + (polygon[next][j] - polygon[i][j]) * t;
       kept[count][k] = position;
@@ -666,42 +672,55 @@ TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {
  * distance, is further than 64 units of the scene's extent as seen from the origin outside of the boxes above it:
  * boxes are tested from origins moved by that much, forth for near corners, back for far ones, at no cost. */
 #define TRB_UNIT 5.9604645e-8f
+#ifndef TRB_REAL                         /* what triangle tests compute in */
+  #ifdef TRBVH_OPENCL_C
+    #define TRB_REAL float
+    #define TRB_NOISE 9.5367432e-7f      /* 16 units of its rounding */
+  #else
+    #define TRB_REAL double
+    #define TRB_NOISE 1.7763568e-15
+  #endif
+#endif
+#define TRB_ABS(x) ((x) < 0 ? -(x) : (x))
 typedef struct trb_ray {
-  float origin[3], inverse[3], tmin, tmax;
-  float near_origin[3], far_origin[3];
-  float shear[3];
-  int   near_corner[3], far_corner[3], axis[3];
+  float    origin[3], inverse[3], tmin, tmax;
+  float    t_unit;                       /* 1, or 2^60 for directions below 2^-60, which are lengthened by that */
+  float    near_origin[3], far_origin[3];
+  TRB_REAL shear[3];
+  int      near_corner[3], far_corner[3], axis[3];
 } trb_ray;
 
 /* Boxes are read as eight floats: min at 0, max at 4. 0 for a ray that can hit nothing: one with a NaN or infinity, or
  * without a direction. */
 TRB_CORE int trb_prepare_ray(trb_ray *r, const TRB_GLOBAL trbvh_ray *ray, const TRB_GLOBAL float *scene) {
-  float x = trb_abs(ray->dir[0]), y = trb_abs(ray->dir[1]), z = trb_abs(ray->dir[2]), extent = 0;
+  float x = trb_abs(ray->dir[0]), y = trb_abs(ray->dir[1]), z = trb_abs(ray->dir[2]), extent = 0, dir[3];
   int k, finite = 1;
+  r->t_unit = x + y + z < 8.6736174e-19f ? 1.1529215e18f : 1.0f;
   for (k = 0; k < 3; k++) {
     float low = trb_abs(scene[k] - ray->origin[k]), high = trb_abs(scene[k + 4] - ray->origin[k]);
     low = TRB_MAX(low, high);
     extent = TRB_MAX(low, extent);
+    dir[k] = ray->dir[k] * r->t_unit;
   }
   for (k = 0; k < 3; k++) {
-    int negative = (int)(trb_bits(ray->dir[k]) >> 31);
+    int negative = (int)(trb_bits(dir[k]) >> 31);
     float pad = (negative ? -64.0f : 64.0f) * TRB_UNIT * extent;
-    finite &= trb_finite(ray->origin[k]) & trb_finite(ray->dir[k]);
+    finite &= trb_finite(ray->origin[k]) & trb_finite(dir[k]);
     r->origin[k] = ray->origin[k];
     r->near_origin[k] = ray->origin[k] + pad;
     r->far_origin[k] = ray->origin[k] - pad;
-    r->inverse[k] = ray->dir[k] != 0 ? 1.0f / ray->dir[k] : trb_float(negative ? 0xFF800000u : 0x7F800000u);
+    r->inverse[k] = dir[k] != 0 ? 1.0f / dir[k] : trb_float(negative ? 0xFF800000u : 0x7F800000u);
     r->near_corner[k] = negative ? k + 4 : k;
     r->far_corner[k] = negative ? k : k + 4;
   }
   r->axis[2] = x >= y ? (x >= z ? 0 : 2) : (y >= z ? 1 : 2);
   r->axis[0] = r->axis[2] == 2 ? 0 : r->axis[2] + 1;
   r->axis[1] = r->axis[0] == 2 ? 0 : r->axis[0] + 1;
-  r->shear[2] = r->inverse[r->axis[2]];
-  r->shear[0] = ray->dir[r->axis[0]] * r->shear[2];
-  r->shear[1] = ray->dir[r->axis[1]] * r->shear[2];
-  r->tmin = TRB_MAX(ray->tmin, 0.0f);
-  r->tmax = ray->tmax == 0 ? FLT_MAX : TRB_MIN(ray->tmax, FLT_MAX);
+  r->shear[2] = 1 / (TRB_REAL)dir[r->axis[2]];
+  r->shear[0] = dir[r->axis[0]] * r->shear[2];
+  r->shear[1] = dir[r->axis[1]] * r->shear[2];
+  r->tmin = TRB_MAX(ray->tmin, 0.0f) / r->t_unit;
+  r->tmax = (ray->tmax == 0 ? FLT_MAX : TRB_MIN(ray->tmax, FLT_MAX)) / r->t_unit;
   return finite && x + y + z > 0 && ray->tmin == ray->tmin && ray->tmax == ray->tmax && r->tmin < r->tmax;
 }
 
@@ -721,40 +740,69 @@ TRB_CORE float trb_hit_box(const TRB_GLOBAL float *box, const trb_ray *r, float 
   return enter <= leave ? enter : -1.0f;
 }
 
+/* Corner v0 + e of a triangle, seen from the ray: x and y across it, z along it. */
+typedef struct trb_corner { TRB_REAL x, y, z; } trb_corner;
+
+TRB_CORE trb_corner trb_see(float x, float y, float z, const trb_ray *r) {
+  trb_corner c;
+  c.z = (TRB_REAL)z - r->origin[r->axis[2]];
+  c.x = (TRB_REAL)x - r->origin[r->axis[0]] - r->shear[0] * c.z;
+  c.y = (TRB_REAL)y - r->origin[r->axis[1]] - r->shear[1] * c.z;
+  return c;
+}
+
+/* How far from a to b the ray passes, 0..1. */
+TRB_CORE TRB_REAL trb_along(trb_corner a, trb_corner b) {
+  TRB_REAL x = a.x - b.x, y = a.y - b.y, along = (a.x * x + a.y * y) / (x * x + y * y);
+  along = TRB_MIN(along, 1);
+  return TRB_MAX(along, 0);
+}
+
 /* Does the ray hit the triangle at tmin < t <= tmax? t, u, v go to hit, the rest of which stays.
  * u, v, w are the edge functions opposite to v0, v1, v2: twice the area of edge and ray, seen along the ray. Two
  * triangles that share an edge compute the same value for it, with the sign that their side has, as long as they get
- * its ends from the same numbers. Where v0 + e1 or v0 + e2 is not the corner that the mesh has, an edge may be off at
- * both ends, by `off`, which changes its function by that times the ends' distances from the ray: a miss by less is a
- * hit then, so that no ray slips through. */
+ * its ends from the same numbers. Where v0 + e1 or v0 + e2 rounds to another number than the corner that the mesh
+ * has, which reserved0 tells, corners may be off by two roundings of the edges. A miss by no more than twice that is a
+ * hit then, of the nearest point of the edge that was missed, so that no ray slips through. */
 TRB_CORE int trb_hit_triangle(const TRB_GLOBAL trbvh_triangle *t, const trb_ray *r, float tmax, trbvh_hit *hit) {
-  const int kx = r->axis[0], ky = r->axis[1], kz = r->axis[2];
-  float az = t->v0[kz] - r->origin[kz], bz = t->v0[kz] + t->e1[kz] - r->origin[kz], cz = t->v0[kz] + t->e2[kz] - r->origin[kz];
-  float ax = t->v0[kx] - r->origin[kx] - r->shear[0] * az, ay = t->v0[ky] - r->origin[ky] - r->shear[1] * az;
-  float bx = t->v0[kx] + t->e1[kx] - r->origin[kx] - r->shear[0] * bz, by = t->v0[ky] + t->e1[ky] - r->origin[ky] - r->shear[1] * bz;
-  float cx = t->v0[kx] + t->e2[kx] - r->origin[kx] - r->shear[0] * cz, cy = t->v0[ky] + t->e2[ky] - r->origin[ky] - r->shear[1] * cz;
-  float u = cx * by - cy * bx, v = ax * cy - ay * cx, w = bx * ay - by * ax;
-  float area = u + v + w, inverse, distance;
-  if (area < 0) { u = -u; v = -v; w = -w; }
-  if (t->reserved0) {
-    float a = trb_abs(ax) + trb_abs(ay), b = trb_abs(bx) + trb_abs(by), c = trb_abs(cx) + trb_abs(cy);
-    float off = 8.0f * TRB_UNIT * (a + b + c + trb_abs(az) + trb_abs(bz) + trb_abs(cz));
-    if (trb_abs(area) <= 0.25f * off * (a + b + c)) return 0;  /* seen from the side: left to its neighbours */
-    u = u < 0 && u >= -off * (b + c) ? 0 : u;
-    v = v < 0 && v >= -off * (a + c) ? 0 : v;
-    w = w < 0 && w >= -off * (a + b) ? 0 : w;
+  const int x = r->axis[0], y = r->axis[1], z = r->axis[2];
+  const trb_corner a = trb_see(t->v0[x], t->v0[y], t->v0[z], r);
+  const trb_corner b = trb_see(t->v0[x] + t->e1[x], t->v0[y] + t->e1[y], t->v0[z] + t->e1[z], r);
+  const trb_corner c = trb_see(t->v0[x] + t->e2[x], t->v0[y] + t->e2[y], t->v0[z] + t->e2[z], r);
+  TRB_REAL u = c.x * b.y - c.y * b.x, v = a.x * c.y - a.y * c.x, w = b.x * a.y - b.y * a.x, area = u + v + w;
+  float distance;
+  if (area < 0) { u = -u; v = -v; w = -w; area = -area; }
+  if (!(area > 0)) return 0;
+  if (!(u >= 0 && v >= 0 && w >= 0)) {
+    float off = 0;
+    int k;
+    if (!t->reserved0) return 0;
+    if (u <= v && u <= w) { u = 0; w = trb_along(b, c); v = 1 - w; }
+    else if (v <= w)      { v = 0; u = trb_along(c, a); w = 1 - u; }
+    else                  { w = 0; v = trb_along(a, b); u = 1 - v; }
+    area = 1;
+    for (k = 0; k < 3; k++) {
+      off = TRB_MAX(trb_abs(t->e1[k]), off);
+      off = TRB_MAX(trb_abs(t->e2[k]), off);
+    }
+    off *= 4 * TRB_UNIT;
+    if (!(TRB_ABS(u * a.x + v * b.x + w * c.x) <= off && TRB_ABS(u * a.y + v * b.y + w * c.y) <= off)) return 0;
+  } else {
+    TRB_REAL width = TRB_ABS(a.x) + TRB_ABS(b.x) + TRB_ABS(c.x), height = TRB_ABS(a.y) + TRB_ABS(b.y) + TRB_ABS(c.y);
+    if (!(area > TRB_NOISE * width * height)) return 0;   /* so thin or so far that u, v, w are nothing but errors */
   }
-  if (!(u >= 0 && v >= 0 && w >= 0 && area != 0)) return 0;
-  inverse = 1.0f / (u + v + w);
-  u *= inverse;
-  v *= inverse;
-  w *= inverse;
-  distance = (u * az + v * bz + w * cz) * r->shear[2];
+  distance = (float)((u * a.z + v * b.z + w * c.z) / area * r->shear[2]);
   if (!(distance > r->tmin && distance <= tmax)) return 0;
   hit->t = distance;
-  hit->u = v;                                        /* the weight of v1 */
-  hit->v = w;                                        /* the weight of v2 */
+  hit->u = (float)(v / area);                        /* the weight of v1 */
+  hit->v = (float)(w / area);                        /* the weight of v2 */
   return 1;
+}
+
+TRB_CORE void trb_miss(const trb_ray *r, trbvh_hit *hit) {
+  hit->t = r->tmax * r->t_unit;
+  hit->u = hit->v = 0;
+  hit->prim = hit->instance = TRBVH_NONE;
 }
 
 /* Closest hit, or with `any` the first one found: front to back, the farther child waiting on the stack with the
@@ -764,10 +812,9 @@ TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbv
                        const trb_ray *r, int any, trbvh_hit *hit) {
   trbvh_u32 stack_node[TRBVH_MAX_DEPTH], height = 0, node = 0, i;
   float     stack_near[TRBVH_MAX_DEPTH];
-  hit->t = r->tmax;
-  hit->u = hit->v = 0;
-  hit->prim = hit->instance = TRBVH_NONE;
+  trb_miss(r, hit);
   if (trb_hit_box((const TRB_GLOBAL float *)&nodes[0], r, r->tmax) < 0) return 0;
+  hit->t = r->tmax;
   for (;;) {
     const trbvh_u32 first = nodes[node].first, count = nodes[node].count;
     if (count == 0) {
@@ -797,7 +844,10 @@ TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbv
       }
     }
     do {
-      if (height == 0) return hit->prim != TRBVH_NONE;
+      if (height == 0) {
+        hit->t *= r->t_unit;
+        return hit->prim != TRBVH_NONE;
+      }
       node = stack_node[--height];
     } while (stack_near[height] > hit->t);
   }
@@ -2302,9 +2352,7 @@ static int trb_query(const trbvh *bvh, const trbvh_ray *ray, int any, trbvh_hit 
   trb_ray r;
   if (trb_prepare_ray(&r, ray, nodes->min) && bvh->triangles)
     return any ? trb_trace(nodes, bvh->triangles, &r, 1, hit) : trb_trace(nodes, bvh->triangles, &r, 0, hit);
-  hit->t = r.tmax;
-  hit->u = hit->v = 0;
-  hit->prim = hit->instance = TRBVH_NONE;
+  trb_miss(&r, hit);
   return 0;
 }
 
@@ -2495,6 +2543,7 @@ static trbvh_result trb_check_tree(const trb_check *c, int split) {
 }
 
 TRBVH_API trbvh_result trbvh_validate(const trbvh *bvh, const trbvh_geometry *geometry, char *why, size_t why_size) {
+  static const trbvh_node padding = {{0, 0, 0}, 0, {0, 0, 0}, 0};
   trb_build b;
   trb_check c;
   trbvh_result result = TRBVH_OK;
@@ -2516,8 +2565,12 @@ TRBVH_API trbvh_result trbvh_validate(const trbvh *bvh, const trbvh_geometry *ge
                         bvh->prim_count, geometry->count, 0);
     if (result) { trb_damage(&c, b.stats.message, 0, 0); return result; }
   }
-  if (bvh->node_count && (bvh->node_count % 2 || !bvh->nodes || !bvh->prims))
-    return trb_damage(&c, "%u nodes, or one of nodes and prims is NULL", bvh->node_count, 0);
+  if (bvh->node_count % 2 || (bvh->node_count == 0) != (bvh->ref_count == 0))
+    return trb_damage(&c, "%u nodes over %u entries of prims[]", bvh->node_count, bvh->ref_count);
+  if (bvh->node_count && (!bvh->nodes || !bvh->prims || (uintptr_t)bvh->nodes % TRB_LINE))
+    return trb_damage(&c, "nodes or prims is NULL, or nodes[] does not begin a cache line", 0, 0);
+  if (bvh->node_count && memcmp(&bvh->nodes[1], &padding, sizeof padding))
+    return trb_damage(&c, "nodes[1], which is padding, is not zero", 0, 0);
   pairs = bvh->node_count / 16 + 1;
   entries = bvh->ref_count / 8 + 1;
   prims = geometry ? bvh->prim_count / 8 + 1 : 0;
