@@ -223,7 +223,7 @@ TRBVH_API void         trbvh_free    (trbvh *bvh);                              
 TRBVH_API size_t       trbvh_bytes_bound(const trbvh_geometry *geometry, const trbvh_options *options, size_t *scratch); /* most that a build will ask for, of the block (returned) and of scratch memory (may be NULL); 0, 0 where the arguments are invalid or too large */
 TRBVH_API double       trbvh_sah     (const trbvh *bvh, float cost_node, float cost_prim);   /* paper's equation 1; 0, 0 = 1.2, 1.0 */
 /* Structure, containment, every primitive reachable; geometry may be NULL. INVALID_ARGUMENT or BAD_DATA with the
- * reason in why (may be NULL), else OK. Allocates one bit a primitive with malloc when geometry is given. */
+ * reason in why (may be NULL), else OK. Allocates some bits a primitive with TRBVH_MALLOC; OUT_OF_MEMORY without. */
 TRBVH_API trbvh_result trbvh_validate(const trbvh *bvh, const trbvh_geometry *geometry, char *why, size_t why_size);
 
 // >>queries ---- const, no allocation, from any thread at once ------------------------------------------------------
@@ -2442,16 +2442,16 @@ TRBVH_API double trbvh_sah(const trbvh *bvh, float cost_node, float cost_prim) {
   return root > 0 ? sum / root : 0;
 }
 
-/* One bit for each pair of siblings, each entry of prims[], each primitive. */
+/* One bit for each pair of siblings, each entry of prims[], each primitive, and three for its corners. */
 typedef struct trb_check {
   const trbvh    *bvh;
   trbvh_geometry  geometry;
-  unsigned char  *pair_seen, *entry_seen, *prim_seen;
+  unsigned char  *pair_seen, *entry_seen, *prim_seen, *corner_seen;
   char           *why;
   size_t          why_size;
 } trb_check;
 
-static int trb_mark(unsigned char *bits, uint32_t i) {         /* 1 when seen before */
+static int trb_mark(unsigned char *bits, size_t i) {           /* 1 when seen before */
   int seen = bits[i >> 3] >> (i & 7) & 1;
   bits[i >> 3] = (unsigned char)(bits[i >> 3] | 1 << (i & 7));
   return seen;
@@ -2468,7 +2468,8 @@ static int trb_inside(const trbvh_node *inner, const trbvh_node *outer) {
   return inside;
 }
 
-/* Entry i of a leaf against the mesh. Where triangles were split, a leaf holds a part of each: boxes must overlap. */
+/* Entry i of a leaf against the mesh. Where triangles were split, a leaf holds a part of each: boxes must overlap, and
+ * each corner be in one of the triangle's leaves. */
 static trbvh_result trb_check_entry(const trb_check *c, const trbvh_node *leaf, uint32_t i, int split) {
   const trbvh *bvh = c->bvh;
   uint32_t prim = bvh->prims[i], vertex;
@@ -2481,6 +2482,11 @@ static trbvh_result trb_check_entry(const trb_check *c, const trbvh_node *leaf, 
   for (k = 0; k < 3; k++) overlap &= box.min[k] <= leaf->max[k] && box.max[k] >= leaf->min[k];
   if (!overlap || (!split && !trb_inside(&box, leaf)))
     return trb_damage(c, "primitive %u is outside of its leaf, entry %u", prim, i);
+  for (k = 0; k < 3 && split; k++) {
+    trbvh_node corner = trb_no_box();
+    trb_include(&corner, v[k], v[k]);
+    if (trb_inside(&corner, leaf)) trb_mark(c->corner_seen, (size_t)prim * 3 + (size_t)k);
+  }
   if (bvh->triangles && !c->geometry.boxes) {
     const trbvh_triangle *t = &bvh->triangles[i];
     for (k = 0; k < 3; k++)
@@ -2549,7 +2555,8 @@ TRBVH_API trbvh_result trbvh_validate(const trbvh *bvh, const trbvh_geometry *ge
   trbvh_result result = TRBVH_OK;
   size_t pairs, entries, prims;
   unsigned char *bits;
-  uint32_t i, valid = 0, vertex;
+  uint32_t i, k, valid = 0, vertex;
+  int split;
   memset(&b, 0, sizeof b);
   memset(&c, 0, sizeof c);
   c.bvh = bvh;
@@ -2573,25 +2580,30 @@ TRBVH_API trbvh_result trbvh_validate(const trbvh *bvh, const trbvh_geometry *ge
     return trb_damage(&c, "nodes[1], which is padding, is not zero", 0, 0);
   pairs = bvh->node_count / 16 + 1;
   entries = bvh->ref_count / 8 + 1;
-  prims = geometry ? bvh->prim_count / 8 + 1 : 0;
-  bits = (unsigned char *)TRBVH_MALLOC(pairs + entries + prims);
+  prims = geometry ? (size_t)bvh->prim_count / 8 + 1 : 0;
+  bits = (unsigned char *)TRBVH_MALLOC(pairs + entries + 4 * prims);
   if (!bits) { trb_damage(&c, "no memory for the check", 0, 0); return TRBVH_OUT_OF_MEMORY; }
-  memset(bits, 0, pairs + entries + prims);
+  memset(bits, 0, pairs + entries + 4 * prims);
   c.geometry = b.input;
   c.pair_seen = bits;
   c.entry_seen = bits + pairs;
   c.prim_seen = geometry ? bits + pairs + entries : NULL;
+  c.corner_seen = bits + pairs + entries + prims;
   for (i = 0; geometry && i < bvh->prim_count; i++) {
     trbvh_node box;
     float v[3][3];
     valid += trb_prim_box(&c.geometry, i, &box, v, &vertex) == 1;
   }
-  if (bvh->node_count) result = trb_check_tree(&c, bvh->ref_count != valid);
+  split = geometry && !geometry->boxes && bvh->ref_count != valid;
+  if (bvh->node_count) result = trb_check_tree(&c, split);
   for (i = 0; geometry && i < bvh->prim_count && !result; i++) {
     trbvh_node box;
     float v[3][3];
-    if (trb_prim_box(&c.geometry, i, &box, v, &vertex) == 1 && !trb_mark(c.prim_seen, i))
-      result = trb_damage(&c, "primitive %u is in no leaf", i, 0);
+    if (trb_prim_box(&c.geometry, i, &box, v, &vertex) != 1) continue;
+    if (!trb_mark(c.prim_seen, i)) result = trb_damage(&c, "primitive %u is in no leaf", i, 0);
+    for (k = 0; k < 3 && split && !result; k++)
+      if (!trb_mark(c.corner_seen, (size_t)i * 3 + k))
+        result = trb_damage(&c, "corner %u of triangle %u is in none of its leaves", k, i);
   }
   TRBVH_FREE(bits);
   return result;
