@@ -1,0 +1,3 @@
+static const golden golden_table[] = {
+  {"", 0, 0, {0, 0, 0, 0}}
+};
