@@ -243,9 +243,9 @@ TRBVH_API trbvh_result trbvh_occluded_n (const trbvh *bvh, const trbvh_ray *rays
 #define TRBVH_IMPLEMENTED
 
 // >>config ---- what differs between the languages and compilers ----------------------------------------------------
-/* Fused multiply-adds round once where C rounds twice: they change costs, and with them trees (style: the same bits
- * everywhere). Compilers fuse by default where the machine can, so this is switched off for our own code, whatever
- * the flags. Not to be repaired from here: -ffast-math, and clang's -ffp-contract=fast. */
+/* Fused multiply-adds round once where C rounds twice: they change costs, and with them trees. Compilers fuse by
+ * default where the machine can, so this is switched off for our own code, whatever the flags; in Visual C++, which
+ * cannot restore it, to the end of the file. Not to be repaired from here: -ffast-math, clang's -ffp-contract=fast. */
 #if defined(TRBVH_OPENCL_C)
   #pragma OPENCL FP_CONTRACT OFF
 #elif defined(__clang__)
@@ -666,11 +666,11 @@ TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {
  * infinities for zeros. For triangles (Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection", JCGT 2013): the
  * axis along which the ray is longest, now called z, and the shear that makes it the z axis.
  *
- * Two bounds of rounding errors make hits independent of the tree. Corners seen from the ray, and with them edges,
- * are off by no more than 12 units of rounding (TRB_UNIT, 2^-24) of their distances: trb_hit_triangle takes a miss by
- * less for a hit, so that no ray slips through an edge whose triangles round it differently. And no such hit, nor its
- * distance, is further than 64 units of the scene's extent as seen from the origin outside of the boxes above it:
- * boxes are tested from origins moved by that much, forth for near corners, back for far ones, at no cost. */
+ * Hits do not depend on the tree, because boxes are tested conservatively: no hit, nor its distance, is further
+ * outside of the boxes above it than 64 units of rounding (TRB_UNIT, 2^-24) of the scene's extent as seen from the
+ * origin. So boxes are tested from origins moved by that much, forth for near corners, back for far ones, at no cost.
+ * Triangles are tested in double where there is one: with float, those seen from the side, or from afar, would be hit
+ * or missed by chance. */
 #define TRB_UNIT 5.9604645e-8f
 #ifndef TRB_REAL                         /* what triangle tests compute in */
   #ifdef TRBVH_OPENCL_C
@@ -1122,9 +1122,8 @@ static double trb_ms(void) {
 
 // >>input ---- arguments made explicit and checked, primitives read whatever their form -----------------------------
 #define TRB_REFS_MAX      0x7FFFFFFFu    /* node indices are twice that */
-#define TRB_PACKED_MAX_BITS 24
 #ifndef TRB_PACKED_REFS                  /* up to here, sort keys hold both code and index. Lower in a test */
-  #define TRB_PACKED_REFS (1u << TRB_PACKED_MAX_BITS)
+  #define TRB_PACKED_REFS (1u << 24)
 #endif
 #define TRB_CODE_BITS     44u            /* of the Morton code in such a key, at most: four digits of the sort */
 #define TRB_DIGIT_BITS    11u
@@ -1347,6 +1346,20 @@ static int trb_load_triangle(const trbvh_geometry *g, uint32_t i, float v[3][3],
     memcpy(v[k], (const char *)g->positions + position * g->position_stride, 12);
   }
   return 1;
+}
+
+/* Asks for a triangle's indices, well before, and for its positions, once they are there. TRB_CORE, always inlined:
+ * gcc takes a function that only prefetches for one without effect, and drops its calls. */
+TRB_CORE void trb_prefetch_indices(const trbvh_geometry *g, uint32_t i) {
+  if (g->indices) TRB_PREFETCH((const char *)g->indices + (size_t)i * 3 * g->index_size);
+}
+
+TRB_CORE void trb_prefetch_positions(const trbvh_geometry *g, uint32_t i) {
+  size_t k, corner = (size_t)i * 3;
+  for (k = 0; k < 3; k++) {
+    size_t position = g->indices ? trb_index(g, corner + k) : corner + k;
+    TRB_PREFETCH((const char *)g->positions + position * g->position_stride);
+  }
 }
 
 static trbvh_node trb_no_box(void) {
@@ -2247,12 +2260,16 @@ static void trb_triangle_job(void *context, uint32_t index) {
     float v[3][3];
     uint32_t inexact = 0;
     int k;
+    if (i + 3 * TRB_AHEAD < end) {
+      trb_prefetch_indices(&b->input, prims[i + 3 * TRB_AHEAD]);
+      trb_prefetch_positions(&b->input, prims[i + TRB_AHEAD]);
+    }
     trb_load_triangle(&b->input, prims[i], v, &vertex);
     for (k = 0; k < 3; k++) {
       out[i].v0[k] = v[0][k];
       out[i].e1[k] = v[1][k] - v[0][k];
       out[i].e2[k] = v[2][k] - v[0][k];
-      inexact |= v[0][k] + out[i].e1[k] != v[1][k] || v[0][k] + out[i].e2[k] != v[2][k];
+      inexact |= (v[0][k] + out[i].e1[k] != v[1][k]) | (v[0][k] + out[i].e2[k] != v[2][k]);
     }
     out[i].prim = prims[i];
     out[i].reserved0 = inexact;

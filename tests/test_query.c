@@ -41,10 +41,10 @@ static void reference_triangle(const float *v, const trbvh_ray *ray, reference *
   }
   det = w[0] + w[1] + w[2];
   memset(r, 0, sizeof *r);
-  if (!(fabs(det) > 0)) {                        /* seen edge-on, or without area */
-    r->error_uv = r->error_t = DBL_MAX;
-    r->out = !memcmp(v, v + 3, 12) || !memcmp(v, v + 6, 12) || !memcmp(v + 3, v + 6, 12) 
-           || fabs(w[0]) + fabs(w[1]) + fabs(w[2]) > 64 * eps * big * edge;
+  r->error_uv = r->error_t = DBL_MAX;
+  if (!memcmp(v, v + 3, 12) || !memcmp(v, v + 6, 12) || !memcmp(v + 3, v + 6, 12)) { r->out = 1; return; }    /* no area */
+  if (!(fabs(det) > 0)) {                        /* seen edge-on */
+    r->out = fabs(w[0]) + fabs(w[1]) + fabs(w[2]) > 64 * eps * big * edge;
     return;
   }
   for (i = 0; i < 3; ++i) w[i] /= det;
