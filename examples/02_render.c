@@ -76,7 +76,7 @@ static uint32_t parse_count(const char *text, const char *option, uint32_t most,
   *end = stop;
   return (uint32_t)count;
 }
-enum { QUALITY, SPLITS, THREADS, DEVICE, SIZE, OUT, OPTIONS };
+enum { OPTION_QUALITY, OPTION_SPLITS, OPTION_THREADS, OPTION_DEVICE, OPTION_SIZE, OPTION_OUT, OPTIONS };
 static const char *const option_names[] = {
   "--quality", "--splits", "--threads", "--device", "--size", "--out"
 };
@@ -87,20 +87,20 @@ static void set_option(settings *s, int option, const char *value)
   const char *name = option_names[option], *end = "";
   char *number_end;
   switch (option) {
-  case QUALITY:
+  case OPTION_QUALITY:
     for (int i = 1; i < 5; i++) if (!strcmp(value, qualities[i])) s->quality = (trbvh_quality)i;
     if (!s->quality) die("%s takes fast, medium, high or best, not '%s'", name, value);
     break;
-  case SPLITS:
+  case OPTION_SPLITS:
     s->splits = strtof(value, &number_end);
     if (number_end == value || *number_end || !(s->splits >= 0 && s->splits <= 16)) {
       die("%s takes 0..16, not '%s'", name, value);
     }
     if (s->splits == 0) s->splits = -1;   /* to the library, 0 is the preset's own value */
     break;
-  case THREADS: s->threads = parse_count(value, name, 1024, &end); break;
-  case DEVICE: s->device = value; break;
-  case SIZE:
+  case OPTION_THREADS: s->threads = parse_count(value, name, 1024, &end); break;
+  case OPTION_DEVICE: s->device = value; break;
+  case OPTION_SIZE:
     s->width = parse_count(value, name, 4096, &end);
     if (*end != 'x') die("%s takes WxH, like 960x640, not '%s'", name, value);
     s->height = parse_count(end + 1, name, 4096, &end);
