@@ -112,7 +112,9 @@ typedef struct trbvh_hit { float t, u, v; trbvh_u32 prim; trbvh_u32 instance; } 
 #ifndef TRBVH_OPENCL_C
 
 #ifndef TRBVH_API                       /* TRBVH_STATIC, or your own export macro */
-  #ifdef TRBVH_STATIC
+  #if defined(TRBVH_STATIC) && defined(__GNUC__)
+    #define TRBVH_API static __attribute__((unused))
+  #elif defined(TRBVH_STATIC)
     #define TRBVH_API static
   #elif defined(__cplusplus)
     #define TRBVH_API extern "C"

@@ -23,8 +23,9 @@ static trbvh_node random_box(rng *r, float size) {
   int k;
   memset(&box, 0, sizeof box);
   for (k = 0; k < 3; k++) {
+    float small = size * rng_unit(r);
     box.min[k] = rng_unit(r);
-    box.max[k] = box.min[k] + size * rng_unit(r) * rng_unit(r);
+    box.max[k] = box.min[k] + small * rng_unit(r);
   }
   return box;
 }

@@ -666,6 +666,38 @@ static void test_meaning_of_tmin_and_tmax(void)
   trbvh_free(&bvh);
 }
 
+/* Thin triangles are hit where they are and nowhere else: diagonal ones, 2^-e thick, in numbers that float holds. */
+static void test_thin_triangles(void)
+{
+  int e, k, axis;
+  for (e = 2; e <= 22; ++e)
+    for (axis = 0; axis < 3; ++axis) {
+      const float thick = power_of_two(-e);
+      float corners[9];
+      const float flat[9] = {-1, -1, 2,  1, 1, 2,  0, thick, 2};
+      trbvh_geometry g;
+      trbvh bvh;
+      memset(&g, 0, sizeof g);
+      memset(&bvh, 0, sizeof bvh);
+      for (k = 0; k < 9; ++k) corners[k / 3 * 3 + (k % 3 + axis) % 3] = flat[k];
+      g.positions = corners;
+      g.count = 1;
+      CHECK(trbvh_build(&bvh, &g, NULL) == TRBVH_OK);
+      for (k = -3; k <= 5; ++k) {
+        trbvh_ray ray;
+        trbvh_hit hit;
+        int inside = k >= 0 && k <= 4;               /* edges and corners belong to it */
+        memset(&ray, 0, sizeof ray);
+        ray.origin[(1 + axis) % 3] = (float)k * thick / 4;
+        ray.dir[(2 + axis) % 3] = 1;
+        CONTEXT("2^-%d thick, axis %d, at %d / 4 of it", e, axis, k);
+        CHECK_MSG(trbvh_intersect(&bvh, &ray, &hit) == inside, "prim %u, u %g, v %g", hit.prim, (double)hit.u, (double)hit.v);
+        if (inside) CHECK_MSG(fabs(hit.v - k / 4.0) < 1e-6 && hit.t >= 2 && hit.t <= 2, "t %.9g, v %g", (double)hit.t, (double)hit.v);
+      }
+      trbvh_free(&bvh);
+    }
+}
+
 static void test_rays_that_hit_nothing(void)
 {
   mesh m;
@@ -753,6 +785,7 @@ int main(int argc, char **argv)
   RUN(test_power_of_two_scales);
   RUN(test_other_scales);
   RUN(test_window_is_exact);
+  RUN(test_thin_triangles);
   RUN(test_rays_that_hit_nothing);
   RUN(test_lowest_index_wins);
   return test_finish();
