@@ -180,7 +180,10 @@ static inline void make_room(scene *s, uint32_t n)
   lattice = (float *)xmalloc(sizeof(float) * 3 * (size_t)(k + 1));
   for (axis = 0; axis < 3; ++axis)
     for (i = 0; i <= k; ++i)
-      lattice[axis * (k + 1) + i] = ((float)i - (float)k / 2 + (i && i < k ? rng_range(&r, -0.375f, 0.375f) : 0.0f)) / (float)(10 + axis);
+    {
+      float shift = i && i < k ? rng_range(&r, -0.375f, 0.375f) : 0.0f;
+      lattice[axis * (k + 1) + i] = ((float)i - (float)k / 2 + shift) / (float)(10 + axis);
+    }
   scene_alloc(s, (uint32_t)(6 * k * k + 2), (uint32_t)(12 * k * k), 1);
   s->vertex_count = 0;
   for (axis = 0; axis < 3; ++axis)
@@ -202,7 +205,8 @@ static inline void make_room(scene *s, uint32_t n)
   free(map);
 }
 
-static inline void make_terrain(scene *s, uint32_t n)        /* heights: a coarse integer lattice, blended in integers */
+/* Heights: a coarse integer lattice, blended in integers. */
+static inline void make_terrain(scene *s, uint32_t n)
 {
   uint32_t m = isqrt(n / 2), i, j, at = 0;
   if (m < 1) m = 1;
@@ -264,7 +268,8 @@ static inline void make_city(scene *s, uint32_t n)
         s->positions[3 * (8 * b + c) + k] = (float)(((double)turn[k][0] * x + (double)turn[k][1] * y + (double)turn[k][2] * z) / 25.0);
     }
     for (f = 0; f < 12; ++f)
-      at = put_triangle(s, at, 8 * b + (uint32_t)faces[f][0], 8 * b + (uint32_t)faces[f][1], 8 * b + (uint32_t)faces[f][2]);
+      at = put_triangle(s, at, 8 * b + (uint32_t)faces[f][0], 8 * b + (uint32_t)faces[f][1],
+          8 * b + (uint32_t)faces[f][2]);
   }
 }
 
@@ -281,7 +286,8 @@ static inline void make_huge_and_tiny(scene *s, uint32_t n)
   }
 }
 
-static inline void make_clusters(scene *s, uint32_t n)       /* 64 heaps, each inside one Morton cell, on a regular grid */
+/* 64 heaps, each inside one Morton cell, on a regular grid. */
+static inline void make_clusters(scene *s, uint32_t n)
 {
   rng r = {7};
   uint32_t i, j, k;
@@ -329,7 +335,8 @@ static inline void make_series(scene *s, uint32_t n)         /* size and place 2
     put3(p, a, 0, 0); put3(p + 3, a * 2, a, a / 2); put3(p + 6, a, a / 2, a);
   }
 }
-static inline void make_nested(scene *s, uint32_t n)         /* all with the same centre, each twice the size of the last */
+/* All with the same centre, each twice the size of the last. */
+static inline void make_nested(scene *s, uint32_t n)
 {
   uint32_t i;
   scene_soup(s, n);
@@ -353,7 +360,8 @@ static inline void make_float_max(scene *s, uint32_t n)      /* corners of the r
   rng r = {8};
   uint32_t i;
   scene_soup(s, n);
-  for (i = 0; i < 9 * n; ++i) s->positions[i] = rng_u32(&r) & 1 ? FLT_MAX : rng_u32(&r) & 1 ? -FLT_MAX : rng_range(&r, -1, 1);
+  for (i = 0; i < 9 * n; ++i)
+    s->positions[i] = rng_u32(&r) & 1 ? FLT_MAX : rng_u32(&r) & 1 ? -FLT_MAX : rng_range(&r, -1, 1);
 }
 static inline void make_all_exponents(scene *s, uint32_t n)  /* any finite bit pattern */
 {
@@ -390,7 +398,8 @@ static inline float bad_float(uint32_t i)
   memcpy(&x, &bits[i % 5], sizeof x);
   return x;
 }
-static inline void make_not_finite(scene *s, uint32_t n)     /* one triangle in three has a NaN or an infinity somewhere */
+/* One triangle in three has a NaN or an infinity somewhere. */
+static inline void make_not_finite(scene *s, uint32_t n)
 {
   rng r = {10};
   uint32_t i;
@@ -413,7 +422,8 @@ static inline void make_signed_zeros(scene *s, uint32_t n)   /* -0 and +0 are th
   scene_soup(s, n);
   for (i = 0; i < 9 * n; ++i) s->positions[i] = rng_u32(&r) & 1 ? 0.0f : rng_u32(&r) & 1 ? -0.0f : rng_unit(&r);
 }
-static inline void make_grid(scene *s, uint32_t n)           /* small integer coordinates: equal costs and ties everywhere */
+/* Small integer coordinates: equal costs and ties everywhere. */
+static inline void make_grid(scene *s, uint32_t n)
 {
   rng r = {12};
   uint32_t i;
@@ -518,7 +528,8 @@ static inline void scene_make(scene *s, const scene_def *def)
 static const char *const preset_names[PRESET_COUNT] = {"FAST", "MEDIUM", "HIGH", "BEST"};
 static inline trbvh_options preset_options(int preset)
 {
-  static const trbvh_quality qualities[PRESET_COUNT] = {TRBVH_QUALITY_FAST, TRBVH_QUALITY_MEDIUM, TRBVH_QUALITY_HIGH, TRBVH_QUALITY_BEST};
+  static const trbvh_quality qualities[PRESET_COUNT] = {TRBVH_QUALITY_FAST, TRBVH_QUALITY_MEDIUM, TRBVH_QUALITY_HIGH,
+      TRBVH_QUALITY_BEST};
   trbvh_options o;
   memset(&o, 0, sizeof o);
   o.quality = qualities[preset];
@@ -530,7 +541,8 @@ static inline int same_tree(const trbvh *a, const trbvh *b)             /* trian
   return a->node_count == b->node_count && a->ref_count == b->ref_count && a->prim_count == b->prim_count
       && same_bits(a->nodes, b->nodes, sizeof(trbvh_node) * a->node_count)
       && same_bits(a->prims, b->prims, sizeof(uint32_t) * a->ref_count)
-      && (!a->triangles || !b->triangles || same_bits(a->triangles, b->triangles, sizeof(trbvh_triangle) * a->ref_count));
+      && (!a->triangles || !b->triangles
+          || same_bits(a->triangles, b->triangles, sizeof(trbvh_triangle) * a->ref_count));
 }
 
 // >>allocator ---- counts, fails on demand, fills with garbage, checks what free is told ------------------------------
@@ -623,7 +635,12 @@ static inline void geometry_box(const trbvh_geometry *g, uint32_t i, float box[6
       }
   }
 }
-static inline int is_finite(float x) { uint32_t bits; memcpy(&bits, &x, 4); return (bits & 0x7F800000u) != 0x7F800000u; }
+static inline int is_finite(float x)
+{
+  uint32_t bits;
+  memcpy(&bits, &x, 4);
+  return (bits & 0x7F800000u) != 0x7F800000u;
+}
 static inline int geometry_skips(const trbvh_geometry *g, uint32_t i)
 {
   float v[9];
@@ -687,7 +704,8 @@ static inline int covered(const trbvh *bvh, const uint32_t *leaves, uint32_t cou
 #define WALK_FAIL(...) do { snprintf(why, why_size, __VA_ARGS__); goto done; } while (0)
 
 /* 1 = fine. split: primitives may stand in several leaves. The geometry is required. */
-static inline int walk_tree(const trbvh *bvh, const trbvh_geometry *g, uint32_t max_leaf, int split, walk_info *info, char *why, size_t why_size)
+static inline int walk_tree(const trbvh *bvh, const trbvh_geometry *g, uint32_t max_leaf, int split, walk_info *info,
+    char *why, size_t why_size)
 {
   uint32_t n = bvh->node_count, refs = bvh->ref_count, i, j, stack_size = 0, reached = 0;
   uint32_t *stack = (uint32_t *)xmalloc(sizeof(uint32_t) * 2 * ((size_t)n + 1));         /* node, depth */
@@ -708,7 +726,8 @@ static inline int walk_tree(const trbvh *bvh, const trbvh_geometry *g, uint32_t 
 
   if (bvh->prim_count != g->count) WALK_FAIL("prim_count %u, geometry has %u", bvh->prim_count, g->count);
   if (g->count == info->skipped) {
-    if (bvh->nodes || n || refs || bvh->triangles) WALK_FAIL("a tree without primitives has %u nodes, %u references", n, refs);
+    if (bvh->nodes || n || refs || bvh->triangles)
+      WALK_FAIL("a tree without primitives has %u nodes, %u references", n, refs);
     ok = 1;
     goto done;
   }
@@ -718,7 +737,8 @@ static inline int walk_tree(const trbvh *bvh, const trbvh_geometry *g, uint32_t 
   if (n < 2 || n % 2) WALK_FAIL("node_count %u", n);
   if (memcmp(&bvh->nodes[1], &zero, sizeof zero)) WALK_FAIL("nodes[1] is not zeros");
   if (!g->boxes && !(bvh->flags & TRBVH_NO_TRIANGLES) && !bvh->triangles) WALK_FAIL("no triangles");
-  if ((g->boxes || (bvh->flags & TRBVH_NO_TRIANGLES)) && bvh->triangles) WALK_FAIL("triangles where there should be none");
+  if ((g->boxes || (bvh->flags & TRBVH_NO_TRIANGLES)) && bvh->triangles)
+    WALK_FAIL("triangles where there should be none");
 
   info->root_area = half_area(&bvh->nodes[0]);
   stack[0] = 0; stack[1] = 0; stack_size = 1;
@@ -730,12 +750,15 @@ static inline int walk_tree(const trbvh *bvh, const trbvh_geometry *g, uint32_t 
     ++reached;
     if (depth > info->depth) info->depth = depth;
     for (k = 0; k < 3; ++k)
-      if (!(node->min[k] <= node->max[k]) || !is_finite(node->min[k]) || !is_finite(node->max[k])) WALK_FAIL("node %u has a bad box", at);
+      if (!(node->min[k] <= node->max[k]) || !is_finite(node->min[k]) || !is_finite(node->max[k]))
+        WALK_FAIL("node %u has a bad box", at);
     if (node->count == 0) {
       const trbvh_node *c = bvh->nodes + node->first;
-      if (node->first % 2 || node->first < 2 || node->first >= n) WALK_FAIL("node %u: first child %u of %u", at, node->first, n);
+      if (node->first % 2 || node->first < 2 || node->first >= n)
+        WALK_FAIL("node %u: first child %u of %u", at, node->first, n);
       for (k = 0; k < 3; ++k) {
-        float lo = c[0].min[k] < c[1].min[k] ? c[0].min[k] : c[1].min[k], hi = c[0].max[k] > c[1].max[k] ? c[0].max[k] : c[1].max[k];
+        float lo = c[0].min[k] < c[1].min[k] ? c[0].min[k] : c[1].min[k];
+        float hi = c[0].max[k] > c[1].max[k] ? c[0].max[k] : c[1].max[k];
         if (!(node->min[k] <= lo && node->max[k] >= hi)) WALK_FAIL("node %u does not contain its children", at);
         if (node->min[k] != lo || node->max[k] != hi) WALK_FAIL("node %u is larger than its children", at);
       }
@@ -746,13 +769,15 @@ static inline int walk_tree(const trbvh *bvh, const trbvh_geometry *g, uint32_t 
       ++info->leaves;
       info->leaf_area += half_area(node) * node->count;
       if (node->count > max_leaf) WALK_FAIL("leaf %u has %u primitives, %u are allowed", at, node->count, max_leaf);
-      if (node->first >= refs || node->count > refs - node->first) WALK_FAIL("leaf %u: run %u + %u of %u", at, node->first, node->count, refs);
+      if (node->first >= refs || node->count > refs - node->first)
+        WALK_FAIL("leaf %u: run %u + %u of %u", at, node->first, node->count, refs);
       for (i = node->first; i < node->first + node->count; ++i) {
         if (leaf_of[i] != 0xFFFFFFFFu) WALK_FAIL("entry %u is in leaves %u and %u", i, leaf_of[i], at);
         leaf_of[i] = at;
         if (bvh->prims[i] >= g->count) WALK_FAIL("entry %u is primitive %u of %u", i, bvh->prims[i], g->count);
         if (geometry_skips(g, bvh->prims[i])) WALK_FAIL("primitive %u should have been skipped", bvh->prims[i]);
-        for (j = node->first; j < i; ++j) if (bvh->prims[i] == bvh->prims[j]) WALK_FAIL("primitive %u twice in leaf %u", bvh->prims[i], at);
+        for (j = node->first; j < i; ++j)
+          if (bvh->prims[i] == bvh->prims[j]) WALK_FAIL("primitive %u twice in leaf %u", bvh->prims[i], at);
       }
     }
   }
@@ -779,7 +804,8 @@ static inline int walk_tree(const trbvh *bvh, const trbvh_geometry *g, uint32_t 
       float box[6];
       geometry_box(g, i, box);
       for (k = 0; k < 3; ++k)
-        if (!(leaf->min[k] <= box[k] && leaf->max[k] >= box[3 + k])) WALK_FAIL("leaf %u does not contain primitive %u", in[0], i);
+        if (!(leaf->min[k] <= box[k] && leaf->max[k] >= box[3 + k]))
+          WALK_FAIL("leaf %u does not contain primitive %u", in[0], i);
     } else {
       float v[9];
       geometry_triangle(g, i, v);

@@ -5,7 +5,10 @@
 #include "test.h"
 #include "scenes.h"
 
-static uint32_t effective_max_leaf(const trbvh_options *o) { return !o->max_leaf ? 8 : o->max_leaf > 16 ? 16 : o->max_leaf; }
+static uint32_t effective_max_leaf(const trbvh_options *o)
+{
+  return !o->max_leaf ? 8 : o->max_leaf > 16 ? 16 : o->max_leaf;
+}
 static double effective_cost(float cost, double preset) { return cost > 0 ? (double)cost : cost < 0 ? 0.0 : preset; }
 
 /* Everything that must hold of a tree just built and of its stats. */
@@ -21,7 +24,8 @@ static void check_tree(const trbvh *bvh, const trbvh_geometry *g, const trbvh_op
   CHECK_MSG(trbvh_validate(bvh, g, why, sizeof why) == TRBVH_OK, "%s", why);
   CHECK(trbvh_validate(bvh, NULL, NULL, 0) == TRBVH_OK);
   sah = walk_sah(info, ci, ct);
-  if (info->root_area > 0) CHECK_MSG(fabs(trbvh_sah(bvh, o->cost_node, o->cost_prim) - sah) <= 1e-6 * sah, "trbvh_sah %.9g, equation 1 %.9g", trbvh_sah(bvh, o->cost_node, o->cost_prim), sah);
+  if (info->root_area > 0) CHECK_MSG(fabs(trbvh_sah(bvh, o->cost_node, o->cost_prim) - sah) <= 1e-6 * sah,
+      "trbvh_sah %.9g, equation 1 %.9g", trbvh_sah(bvh, o->cost_node, o->cost_prim), sah);
   CHECK_MSG(trbvh_sah(bvh, 0, 0) >= 0 && trbvh_sah(bvh, 0, 0) <= DBL_MAX, "trbvh_sah %g", trbvh_sah(bvh, 0, 0));
   if (s) {
     CHECK_MSG(s->node_count == bvh->node_count, "stats %u, tree %u", s->node_count, bvh->node_count);
@@ -29,8 +33,10 @@ static void check_tree(const trbvh *bvh, const trbvh_geometry *g, const trbvh_op
     CHECK_MSG(s->ref_count == bvh->ref_count, "stats %u, tree %u", s->ref_count, bvh->ref_count);
     CHECK_MSG(s->max_depth == info->depth, "stats %u, walk %u", s->max_depth, info->depth);
     CHECK_MSG(s->skipped_count == info->skipped, "stats %u, walk %u", s->skipped_count, info->skipped);
-    CHECK_MSG(info->root_area > 0 ? fabs(s->sah_cost - sah) <= 1e-6 * sah : s->sah_cost >= 0 && s->sah_cost <= DBL_MAX, "stats %.9g, walk %.9g", s->sah_cost, sah);
-    CHECK(s->ms_total >= 0 && s->ms_split >= 0 && s->ms_morton >= 0 && s->ms_sort >= 0 && s->ms_hierarchy >= 0 && s->ms_treelets >= 0 && s->ms_collapse >= 0 && s->ms_finish >= 0);
+    CHECK_MSG(info->root_area > 0 ? fabs(s->sah_cost - sah) <= 1e-6 * sah : s->sah_cost >= 0 && s->sah_cost <= DBL_MAX,
+        "stats %.9g, walk %.9g", s->sah_cost, sah);
+    CHECK(s->ms_total >= 0 && s->ms_split >= 0 && s->ms_morton >= 0 && s->ms_sort >= 0 && s->ms_hierarchy >= 0
+        && s->ms_treelets >= 0 && s->ms_collapse >= 0 && s->ms_finish >= 0);
     CHECK(s->ms_transfer <= 0 && s->on_device == 0);
     CHECK_MSG(s->message[0] == 0, "message after a success: %s", s->message);
   }
@@ -51,7 +57,8 @@ static void check_freed(trbvh *bvh, const counter *c)
   trbvh zero;
   memset(&zero, 0, sizeof zero);
   trbvh_free(bvh);
-  CHECK(!bvh->nodes && !bvh->prims && !bvh->triangles && !bvh->wide && !bvh->block && !bvh->node_count && !bvh->ref_count && !bvh->prim_count);
+  CHECK(!bvh->nodes && !bvh->prims && !bvh->triangles && !bvh->wide && !bvh->block && !bvh->node_count
+      && !bvh->ref_count && !bvh->prim_count);
   trbvh_free(bvh);
   CHECK_MSG(c->live == 0 && c->bad_frees == 0, "%u blocks live, %u bad frees", c->live, c->bad_frees);
 }
@@ -79,16 +86,20 @@ static void test_every_scene_and_preset(void)
       CHECK_MSG(result == TRBVH_OK, "%s: %s", trbvh_result_text(result), stats.message);
       if (result) continue;
       check_tree(&bvh, &g, &o, preset >= 2, &info);
-      CHECK_MSG(bvh.ref_count <= s.count + (preset >= 2 ? (uint32_t)(0.3 * s.count) : 0u), "%u references of %u triangles", bvh.ref_count, s.count);
+      CHECK_MSG(bvh.ref_count <= s.count + (preset >= 2 ? (uint32_t)(0.3 * s.count) : 0u),
+          "%u references of %u triangles", bvh.ref_count, s.count);
       CHECK(bvh.flags == 0 && bvh.prim_count == s.count);
       CHECK_MSG(c.allocs <= 2, "%u allocations", c.allocs);
       CHECK_MSG(c.live == (bvh.block != NULL), "%u blocks live", c.live);
       CHECK_MSG(c.live_bytes == bvh.block_size, "%zu bytes live, block_size %zu", c.live_bytes, bvh.block_size);
-      CHECK_MSG(stats.bytes_result <= bound && bvh.block_size <= bound, "result %zu, block %zu, bound %zu", stats.bytes_result, bvh.block_size, bound);
+      CHECK_MSG(stats.bytes_result <= bound && bvh.block_size <= bound, "result %zu, block %zu, bound %zu",
+          stats.bytes_result, bvh.block_size, bound);
       CHECK_MSG(stats.bytes_scratch <= scratch, "scratch %zu, bound %zu", stats.bytes_scratch, scratch);
       CHECK_MSG(c.peak_bytes <= bound + scratch, "peak %zu, bounds %zu and %zu", c.peak_bytes, bound, scratch);
-      CHECK_MSG(c.largest <= (bound > scratch ? bound : scratch), "allocation of %zu, bounds %zu and %zu", c.largest, bound, scratch);
-      CHECK_MSG(stats.bytes_result + stats.bytes_scratch >= c.peak_bytes, "stats %zu and %zu, peak %zu", stats.bytes_result, stats.bytes_scratch, c.peak_bytes);
+      CHECK_MSG(c.largest <= (bound > scratch ? bound : scratch), "allocation of %zu, bounds %zu and %zu", c.largest,
+          bound, scratch);
+      CHECK_MSG(stats.bytes_result + stats.bytes_scratch >= c.peak_bytes, "stats %zu and %zu, peak %zu",
+          stats.bytes_result, stats.bytes_scratch, c.peak_bytes);
       check_freed(&bvh, &c);
     }
     scene_free(&s);
@@ -194,7 +205,11 @@ static void test_boxes(void)
     odd = (unsigned char *)xmalloc(31 * (size_t)s.count + 1);
     for (i = 0; i < s.count; ++i) {
       geometry_box(&mesh, i, boxes + 6 * i);
-      if (i % 50 == 49) { float *b = boxes + 6 * i + i / 50 % 3, x = b[0]; b[0] = b[3]; b[3] = x; }   /* min > max, or flat */
+      if (i % 50 == 49) {                                          /* min > max, or flat */
+        float *b = boxes + 6 * i + i / 50 % 3, x = b[0];
+        b[0] = b[3];
+        b[3] = x;
+      }
       memcpy(odd + 1 + 31 * (size_t)i, boxes + 6 * i, 24);
     }
     memset(&g, 0, sizeof g);
@@ -215,11 +230,13 @@ static void test_boxes(void)
       CHECK_MSG(result == TRBVH_OK, "%s: %s", trbvh_result_text(result), stats.message);
       if (result) continue;
       check_tree(&bvh, &g, &o, 0, &info);
-      CHECK_MSG(c.peak_bytes <= bound + scratch && c.largest <= (bound > scratch ? bound : scratch), "peak %zu, bounds %zu and %zu", c.peak_bytes, bound, scratch);
+      CHECK_MSG(c.peak_bytes <= bound + scratch && c.largest <= (bound > scratch ? bound : scratch),
+          "peak %zu, bounds %zu and %zu", c.peak_bytes, bound, scratch);
       CHECK(!trbvh_intersect(&bvh, &ray, &hit) && hit.prim == TRBVH_NONE && !trbvh_occluded(&bvh, &ray));
       hit.prim = 5;
       result = trbvh_intersect_n(&bvh, &ray, &hit, 1, NULL);
-      CHECK_MSG(result == TRBVH_INVALID_ARGUMENT || (result == TRBVH_OK && hit.prim == TRBVH_NONE), "%s, prim %u", trbvh_result_text(result), hit.prim);
+      CHECK_MSG(result == TRBVH_INVALID_ARGUMENT || (result == TRBVH_OK && hit.prim == TRBVH_NONE), "%s, prim %u",
+          trbvh_result_text(result), hit.prim);
       g.boxes = odd + 1; g.box_stride = 31;
       CHECK_MSG(same_build(&bvh, &g, &o), "unaligned boxes, stride 31");
       g.boxes = boxes; g.box_stride = 0;
@@ -238,7 +255,8 @@ static void test_what_presets_mean(void)
   for (at = 0; at < SCENE_COUNT; ++at) {
     scene s;
     trbvh_geometry g;
-    trbvh_options o, fast = preset_options(0), medium = preset_options(1), high = preset_options(2), best = preset_options(3);
+    trbvh_options o, fast = preset_options(0), medium = preset_options(1);
+    trbvh_options high = preset_options(2), best = preset_options(3);
     trbvh tree_fast, tree_medium, tree_high;
     if (scene_defs[at].flags & SCENE_BIG) continue;
     scene_make(&s, &scene_defs[at]);
@@ -311,7 +329,8 @@ static void test_sah_order(void)
     one = sah_with(&g, &o, NULL);
     o.treelet_rounds = 5;
     five = sah_with(&g, &o, NULL);
-    CHECK_MSG(fast * 1.0001 >= one && one * 1.0001 >= medium && medium * 1.0001 >= five, "rounds 0, 1, 3, 5: SAH %g, %g, %g, %g", fast, one, medium, five);
+    CHECK_MSG(fast * 1.0001 >= one && one * 1.0001 >= medium && medium * 1.0001 >= five,
+        "rounds 0, 1, 3, 5: SAH %g, %g, %g, %g", fast, one, medium, five);
     if (strcmp(s.name, "huge_and_tiny")) CHECK_MSG(medium < fast * 0.99, "treelets gain nothing: %g, %g", fast, medium);
     scene_free(&s);
   }
@@ -361,9 +380,11 @@ static void test_options(void)
         o.split_budget = budgets[i];
         CONTEXT("scene %s, split_budget %g", s.name, (double)budgets[i]);
         sah_with(&g, &o, &refs);
-        CHECK_MSG(refs <= s.count + (budgets[i] > 0 ? (double)budgets[i] * s.count : 0.0), "%u references of %u triangles", refs, s.count);
+        CHECK_MSG(refs <= s.count + (budgets[i] > 0 ? (double)budgets[i] * s.count : 0.0),
+            "%u references of %u triangles", refs, s.count);
         if (!strcmp(s.name, "slivers") && budgets[i] <= 1 && budgets[i] * (float)s.count > 1) {
-          CHECK_MSG(refs > last && (double)refs > s.count + 0.5 * (double)budgets[i] * s.count, "%u references, budget hardly used; last %u", refs, last);
+          CHECK_MSG(refs > last && (double)refs > s.count + 0.5 * (double)budgets[i] * s.count,
+              "%u references, budget hardly used; last %u", refs, last);
           last = refs;
         }
       }
@@ -388,7 +409,8 @@ static void test_costs_matter(void)
   CHECK(trbvh_build(&a, &g, &o) == TRBVH_OK);
   o.cost_node = 0.01f;
   CHECK(trbvh_build(&b, &g, &o) == TRBVH_OK);
-  CHECK_MSG(b.node_count > a.node_count, "%u nodes where nodes are cheap, %u where they are dear", b.node_count, a.node_count);
+  CHECK_MSG(b.node_count > a.node_count, "%u nodes where nodes are cheap, %u where they are dear", b.node_count,
+      a.node_count);
   o.max_leaf = 1;
   CHECK(trbvh_build(&b, &g, &o) == TRBVH_OK);
   CHECK_MSG(b.node_count == 2 * s.count, "%u nodes for %u triangles of their own", b.node_count, s.count);
@@ -399,7 +421,8 @@ static void test_costs_matter(void)
 
 static void test_depth_is_bounded(void)
 {
-  static const char *const names[] = {"deep", "deep_bushy", "series", "nested", "duplicates", "one_point", "clusters", "all_exponents", "identical"};
+  static const char *const names[] = {"deep", "deep_bushy", "series", "nested", "duplicates", "one_point", "clusters",
+      "all_exponents", "identical"};
   unsigned at, n;
   int preset, rounds;
   for (n = 0; n < sizeof names / sizeof names[0]; ++n)
@@ -454,7 +477,8 @@ static void test_no_triangles_flag(void)
     CHECK_MSG(bound < bound_with, "bounds %zu, %zu", bound, bound_with);
     CHECK(trbvh_build(&without, &g, &o) == TRBVH_OK);
     CHECK(!without.triangles && without.flags == TRBVH_NO_TRIANGLES && same_tree(&with, &without));
-    CHECK_MSG(without.block_size <= bound && without.block_size < with.block_size, "blocks %zu, %zu", without.block_size, with.block_size);
+    CHECK_MSG(without.block_size <= bound && without.block_size < with.block_size, "blocks %zu, %zu",
+        without.block_size, with.block_size);
     check_tree(&without, &g, &o, preset >= 2, &info);
     CHECK(trbvh_intersect(&with, &ray, &hit));
     CHECK(!trbvh_intersect(&without, &ray, &hit) && hit.prim == TRBVH_NONE && !trbvh_occluded(&without, &ray));
@@ -476,7 +500,8 @@ static void test_no_triangles_flag(void)
 static void test_rebuild(void)
 {
   static const struct { int scene_size; int preset; int reuse; } steps[] = {
-    {3000, 1, 0}, {3000, 1, 1}, {2000, 1, 1}, {3000, 0, 0}, {0, 1, 0}, {100, 2, 0}, {6000, 2, 0}, {3000, 2, 1}, {1, 0, 1}, {6000, 2, 1}
+    {3000, 1, 0}, {3000, 1, 1}, {2000, 1, 1}, {3000, 0, 0}, {0, 1, 0}, {100, 2, 0}, {6000, 2, 0}, {3000, 2, 1},
+    {1, 0, 1}, {6000, 2, 1}
   };
   unsigned i;
   counter c, other;
@@ -501,7 +526,8 @@ static void test_rebuild(void)
     check_tree(&bvh, &g, &o, steps[i].preset >= 2, &info);
     CHECK_MSG(c.allocs - before <= (steps[i].reuse ? 1u : 2u), "%u allocations", c.allocs - before);
     if (steps[i].reuse) CHECK_MSG(block && bvh.block == block, "the block was not reused");
-    CHECK_MSG(c.live == (bvh.block != NULL) && c.live_bytes == bvh.block_size && !c.bad_frees, "%u live, %zu bytes, block_size %zu", c.live, c.live_bytes, bvh.block_size);
+    CHECK_MSG(c.live == (bvh.block != NULL) && c.live_bytes == bvh.block_size && !c.bad_frees,
+        "%u live, %zu bytes, block_size %zu", c.live, c.live_bytes, bvh.block_size);
     memset(&o.allocator, 0, sizeof o.allocator);
     CHECK_MSG(same_build(&bvh, &g, &o), "a tree built again differs from a new one");
     scene_free(&s);
@@ -517,7 +543,8 @@ static void test_rebuild(void)
     CONTEXT("another allocator");
     o.allocator = counter_allocator(&other);
     CHECK(trbvh_build(&bvh, &g, &o) == TRBVH_OK);
-    CHECK_MSG(c.live == 0 && c.bad_frees == 0 && other.live == 1 && other.bad_frees == 0, "%u and %u live, %u and %u bad frees", c.live, other.live, c.bad_frees, other.bad_frees);
+    CHECK_MSG(c.live == 0 && c.bad_frees == 0 && other.live == 1 && other.bad_frees == 0,
+        "%u and %u live, %u and %u bad frees", c.live, other.live, c.bad_frees, other.bad_frees);
     memset(&o.allocator, 0, sizeof o.allocator);
     g.count = 10;
     CHECK(trbvh_build(&bvh, &g, &o) == TRBVH_OK);                   /* small: may or may not stay where it is */
@@ -555,8 +582,10 @@ static void test_empty(void)
       result = trbvh_build(&bvh, &g, &o);
       CHECK_MSG(result == TRBVH_OK, "%s", trbvh_result_text(result));
       CHECK(!bvh.nodes && !bvh.node_count && !bvh.ref_count && !bvh.prim_count);
-      CHECK(!stats.node_count && !stats.leaf_count && !stats.ref_count && !stats.max_depth && !stats.skipped_count && fabs(stats.sah_cost) <= 0);
-      CHECK(!trbvh_intersect(&bvh, &ray, &hit) && hit.prim == TRBVH_NONE && hit.instance == TRBVH_NONE && hit.t >= FLT_MAX && fabs((double)hit.u) + fabs((double)hit.v) <= 0);
+      CHECK(!stats.node_count && !stats.leaf_count && !stats.ref_count && !stats.max_depth && !stats.skipped_count
+          && fabs(stats.sah_cost) <= 0);
+      CHECK(!trbvh_intersect(&bvh, &ray, &hit) && hit.prim == TRBVH_NONE && hit.instance == TRBVH_NONE
+          && hit.t >= FLT_MAX && fabs((double)hit.u) + fabs((double)hit.v) <= 0);
       CHECK(!trbvh_occluded(&bvh, &ray));
       CHECK(trbvh_intersect_n(&bvh, &ray, &hit, 1, NULL) == TRBVH_OK && hit.prim == TRBVH_NONE);
       CHECK(trbvh_occluded_n(&bvh, &ray, &occluded, 1, &o) == TRBVH_OK && occluded == 0);
@@ -584,7 +613,8 @@ static void test_bytes_bound(void)
     size_t bound;
     g.count = n;
     bound = trbvh_bytes_bound(&g, &o, &scratch);
-    CHECK_MSG(bound > last && scratch >= last_scratch, "%u triangles: %zu, %zu; fewer: %zu, %zu", n, bound, scratch, last, last_scratch);
+    CHECK_MSG(bound > last && scratch >= last_scratch, "%u triangles: %zu, %zu; fewer: %zu, %zu", n, bound, scratch,
+        last, last_scratch);
     CHECK_MSG(bound == trbvh_bytes_bound(&g, NULL, NULL), "%u triangles", n);
     CHECK_MSG(bound / n <= 64 + 4 + 48 + 1024 / n, "%zu bytes for %u triangles", bound, n);
     last = bound;
@@ -630,26 +660,29 @@ static uint32_t find_node(const trbvh *bvh, uint32_t from, int leaf)
   return from;
 }
 
-enum {
-  CHILD_ODD, CHILD_BEYOND, CHILD_IS_ROOT, CHILD_CYCLE, CHILD_SHARED, CHILD_HUGE, CYCLE_ALIKE, SHARED_ALIKE, LEAF_FIRST, LEAF_FIRST_HUGE, LEAF_COUNT, LEAF_COUNT_HUGE, LEAF_LONGER, LEAF_SHORTER,
-  LEAF_TO_INNER, INNER_TO_LEAF, BOX_OUTSIDE_PARENT, BOX_NAN, BOX_INVERTED, ROOT_BOX_SHRUNK, PRIM_BEYOND, PRIM_HUGE, PADDING, NODE_COUNT_MORE, NODE_COUNT_LESS,
-  NODE_COUNT_ZERO, NODE_COUNT_ODD, REF_COUNT_MORE, REF_COUNT_LESS, NODES_NULL, PRIMS_NULL, NODES_ALIGNMENT, TRIANGLE_PRIM,
-  NEEDS_GEOMETRY,
-  LEAF_BOX_SHRUNK, PRIM_LOST, PRIMS_SWAPPED, TRIANGLE_V0, TRIANGLE_E1, TRIANGLE_E2, PRIM_COUNT, GEOMETRY_MOVED, GEOMETRY_COUNT,
-  DAMAGE_COUNT
-};
-static const char *const damage_names[DAMAGE_COUNT] = {
-  "CHILD_ODD", "CHILD_BEYOND", "CHILD_IS_ROOT", "CHILD_CYCLE", "CHILD_SHARED", "CHILD_HUGE", "CYCLE_ALIKE", "SHARED_ALIKE", "LEAF_FIRST", "LEAF_FIRST_HUGE", "LEAF_COUNT", "LEAF_COUNT_HUGE", "LEAF_LONGER", "LEAF_SHORTER",
-  "LEAF_TO_INNER", "INNER_TO_LEAF", "BOX_OUTSIDE_PARENT", "BOX_NAN", "BOX_INVERTED", "ROOT_BOX_SHRUNK", "PRIM_BEYOND", "PRIM_HUGE", "PADDING", "NODE_COUNT_MORE", "NODE_COUNT_LESS",
-  "NODE_COUNT_ZERO", "NODE_COUNT_ODD", "REF_COUNT_MORE", "REF_COUNT_LESS", "NODES_NULL", "PRIMS_NULL", "NODES_ALIGNMENT", "TRIANGLE_PRIM",
-  "", "LEAF_BOX_SHRUNK", "PRIM_LOST", "PRIMS_SWAPPED", "TRIANGLE_V0", "TRIANGLE_E1", "TRIANGLE_E2", "PRIM_COUNT", "GEOMETRY_MOVED", "GEOMETRY_COUNT"
-};
+/* Each kind of damage; from NEEDS_GEOMETRY on, only the geometry tells. One list for the enumeration and the names. */
+#define DAMAGES(X) \
+  X(CHILD_ODD) X(CHILD_BEYOND) X(CHILD_IS_ROOT) X(CHILD_CYCLE) X(CHILD_SHARED) X(CHILD_HUGE) X(CYCLE_ALIKE) \
+  X(SHARED_ALIKE) X(LEAF_FIRST) X(LEAF_FIRST_HUGE) X(LEAF_COUNT) X(LEAF_COUNT_HUGE) X(LEAF_LONGER) X(LEAF_SHORTER) \
+  X(LEAF_TO_INNER) X(INNER_TO_LEAF) X(BOX_OUTSIDE_PARENT) X(BOX_NAN) X(BOX_INVERTED) X(ROOT_BOX_SHRUNK) \
+  X(PRIM_BEYOND) X(PRIM_HUGE) X(PADDING) X(NODE_COUNT_MORE) X(NODE_COUNT_LESS) X(NODE_COUNT_ZERO) X(NODE_COUNT_ODD) \
+  X(REF_COUNT_MORE) X(REF_COUNT_LESS) X(NODES_NULL) X(PRIMS_NULL) X(NODES_ALIGNMENT) X(TRIANGLE_PRIM) \
+  X(NEEDS_GEOMETRY) \
+  X(LEAF_BOX_SHRUNK) X(PRIM_LOST) X(PRIMS_SWAPPED) X(TRIANGLE_V0) X(TRIANGLE_E1) X(TRIANGLE_E2) X(PRIM_COUNT) \
+  X(GEOMETRY_MOVED) X(GEOMETRY_COUNT)
+#define X(name) name,
+enum { DAMAGES(X) DAMAGE_COUNT };
+#undef X
+#define X(name) #name,
+static const char *const damage_names[] = { DAMAGES(X) "" };
+#undef X
 
 static void damage(int kind, tree_copy *t, trbvh_geometry *g, float *positions)
 {
   trbvh *b = &t->bvh;
   trbvh_node *n = t->nodes;
-  uint32_t inner = find_node(b, 2, 0), inner2 = find_node(b, inner + 1, 0), leaf = find_node(b, 2, 1), leaf2 = find_node(b, leaf + 1, 1);
+  uint32_t inner = find_node(b, 2, 0), inner2 = find_node(b, inner + 1, 0);
+  uint32_t leaf = find_node(b, 2, 1), leaf2 = find_node(b, leaf + 1, 1);
   uint32_t last = b->ref_count - 1;
   switch (kind) {
     case CHILD_ODD:          n[inner].first += 1; break;
@@ -659,14 +692,20 @@ static void damage(int kind, tree_copy *t, trbvh_geometry *g, float *positions)
     case CHILD_SHARED:       n[inner].first = n[inner2].first; break;
     case CHILD_HUGE:         n[inner].first = 0xFFFFFFFEu; break;
     case CYCLE_ALIKE: case SHARED_ALIKE:                   /* all boxes alike: nothing but the links is wrong */
-      for (last = 2; last < b->node_count; ++last) { memcpy(n[last].min, n[0].min, 12); memcpy(n[last].max, n[0].max, 12); }
+      for (last = 2; last < b->node_count; ++last) {
+        memcpy(n[last].min, n[0].min, 12);
+        memcpy(n[last].max, n[0].max, 12);
+      }
       n[inner].first = kind == CYCLE_ALIKE ? inner & ~1u : n[inner2].first;
       break;
     case LEAF_FIRST:         n[leaf].first = b->ref_count; break;
     case LEAF_FIRST_HUGE:    n[leaf].first = 0xFFFFFFFFu; break;
     case LEAF_COUNT:         n[leaf].count = b->ref_count + 1; break;
     case LEAF_COUNT_HUGE:    n[leaf].count = 0xFFFFFFFFu; break;
-    case LEAF_LONGER:        while (n[leaf].first + n[leaf].count > last) leaf = find_node(b, leaf + 1, 1); n[leaf].count += 1; break;
+    case LEAF_LONGER:
+      while (n[leaf].first + n[leaf].count > last) leaf = find_node(b, leaf + 1, 1);
+      n[leaf].count += 1;
+      break;
     case LEAF_SHORTER:       while (n[leaf].count < 2) leaf = find_node(b, leaf + 1, 1); n[leaf].count -= 1; break;
     case LEAF_TO_INNER:      n[leaf].count = 0; n[leaf].first = n[inner2].first; break;
     case INNER_TO_LEAF:      n[inner].count = 1; n[inner].first = 0; break;
@@ -722,7 +761,8 @@ static void test_validate_sees_damage(void)
       tree_copy copy;
       float saved = s.positions[9 * 5];
       char why[128] = "", small[8] = "0123456";
-      if (kind == NEEDS_GEOMETRY || (kind == PRIM_LOST && preset >= 2)) continue;     /* a split triangle may have more entries */
+      if (kind == NEEDS_GEOMETRY) continue;
+      if (kind == PRIM_LOST && preset >= 2) continue;                /* a split triangle may have more entries */
       memset(&bvh, 0, sizeof bvh);
       CHECK(trbvh_build(&bvh, &whole, &o) == TRBVH_OK);
       copy_tree(&copy, &bvh);
@@ -735,7 +775,8 @@ static void test_validate_sees_damage(void)
         CHECK_MSG(with == TRBVH_BAD_DATA || with == TRBVH_INVALID_ARGUMENT, "%s", trbvh_result_text(with));
         CHECK_MSG(why[0] && memchr(why, 0, sizeof why), "no reason given");
         CHECK(trbvh_validate(&copy.bvh, &g, NULL, 0) == with && trbvh_validate(&copy.bvh, &g, why, 0) == with);
-        if (kind < NEEDS_GEOMETRY) CHECK_MSG(without != TRBVH_OK && memchr(small, 0, 5) && small[0], "without geometry: %s, \"%.5s\"", trbvh_result_text(without), small);
+        if (kind < NEEDS_GEOMETRY) CHECK_MSG(without != TRBVH_OK && memchr(small, 0, 5) && small[0],
+            "without geometry: %s, \"%.5s\"", trbvh_result_text(without), small);
         CHECK_MSG(small[5] == '5', "wrote past the end of why");
       }
       s.positions[9 * 5] = saved;

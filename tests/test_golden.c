@@ -89,7 +89,8 @@ static int print_table(void)
 {
   unsigned i;
   int preset;
-  printf("/* Made by a program, for test_golden.c, which says when and how to make it anew:\n *     %s\n", GOLDEN_COMMAND);
+  printf("/* Made by a program, for test_golden.c, which says when and how to make it anew:\n *     %s\n",
+      GOLDEN_COMMAND);
   printf(" * FNV-1a of the scene, and of nodes[] and prims[] of the tree that each preset makes. */\n");
   printf("static const golden golden_table[] = {\n");
   for (i = 0; i < CASE_COUNT; ++i) {
@@ -111,7 +112,8 @@ static const golden *find_golden(unsigned at)
 {
   unsigned i;
   for (i = 0; i < GOLDEN_COUNT; ++i)
-    if (!strcmp(golden_table[i].scene, cases[at].scene) && golden_table[i].triangles == cases[at].triangles) return &golden_table[i];
+    if (!strcmp(golden_table[i].scene, cases[at].scene) && golden_table[i].triangles == cases[at].triangles)
+      return &golden_table[i];
   return NULL;
 }
 
@@ -133,11 +135,13 @@ static void test_golden_hashes(void)
     if (want) {
       ++found;
       input = hash_scene(&s);
-      CHECK_MSG(input == want->input, "scene %s of %u itself differs here: expected %016llX, got %016llX", s.name, cases[i].triangles, (unsigned long long)want->input, (unsigned long long)input);
+      CHECK_MSG(input == want->input, "scene %s of %u itself differs here: expected %016llX, got %016llX", s.name,
+          cases[i].triangles, (unsigned long long)want->input, (unsigned long long)input);
       for (preset = 0; preset < PRESET_COUNT; ++preset) {
         trbvh_options o = preset_options(preset);
         uint64_t got = build_and_hash(&s, &o);
-        CHECK_MSG(got == want->trees[preset], "scene %s of %u, preset %s: expected %016llX, got %016llX", s.name, cases[i].triangles, preset_names[preset], (unsigned long long)want->trees[preset], (unsigned long long)got);
+        CHECK_MSG(got == want->trees[preset], "scene %s of %u, preset %s: expected %016llX, got %016llX", s.name,
+            cases[i].triangles, preset_names[preset], (unsigned long long)want->trees[preset], (unsigned long long)got);
       }
     }
     scene_free(&s);
@@ -197,7 +201,8 @@ static void test_golden_threads(void)
           o.jobs.parallel_for = own ? NULL : reversed_for;
           o.jobs.width = widths[w];
           got = build_and_hash(&s, &o);
-          CONTEXT("scene %s of %u, preset %s, width %u, %s", s.name, cases[i].triangles, preset_names[preset], widths[w], own ? "threads of the library" : "parallel_for");
+          CONTEXT("scene %s of %u, preset %s, width %u, %s", s.name, cases[i].triangles, preset_names[preset],
+              widths[w], own ? "threads of the library" : "parallel_for");
           CHECK_MSG(got == want, "expected %016llX, got %016llX", (unsigned long long)want, (unsigned long long)got);
         }
     }

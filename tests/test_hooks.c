@@ -14,7 +14,8 @@
   #include <pthread.h>
 #endif
 
-static const char *const hook_scenes[] = {"random", "sphere", "slivers", "not_finite", "deep", "n0", "n1", "n9", "large_random", "large_slivers", "large_bushy", "large_holes"};
+static const char *const hook_scenes[] = {"random", "sphere", "slivers", "not_finite", "deep", "n0", "n1", "n9",
+    "large_random", "large_slivers", "large_bushy", "large_holes"};
 #define HOOK_SCENES 8u                                               /* small */
 #define HOOK_LARGE  (sizeof hook_scenes / sizeof hook_scenes[0])     /* with those of several jobs */
 
@@ -28,7 +29,8 @@ static void hook_scene(scene *s, unsigned at, uint32_t n)
 }
 static int tree_is_empty(const trbvh *b)
 {
-  return !b->nodes && !b->prims && !b->triangles && !b->node_count && !b->ref_count && !b->prim_count && !b->block && !b->block_size;
+  return !b->nodes && !b->prims && !b->triangles && !b->node_count && !b->ref_count && !b->prim_count && !b->block
+      && !b->block_size;
 }
 
 // >>memory ----------------------------------------------------------------------------------------------------------
@@ -55,7 +57,8 @@ static void test_every_allocation_may_fail(void)
             memset(&c, 0, sizeof c);
             memset(&stats, 0x55, sizeof stats);
             o.allocator = counter_allocator(&c);
-            CONTEXT("scene %s, preset %s, rebuilt %u, width %d, allocation %u fails", s.name, preset_names[preset], rebuilt, width, n + 1);
+            CONTEXT("scene %s, preset %s, rebuilt %u, width %d, allocation %u fails", s.name, preset_names[preset],
+                rebuilt, width, n + 1);
             if (rebuilt) {
               trbvh_geometry before = g;
               if (rebuilt == 1 && before.count > 5) before.count = 5;
@@ -104,7 +107,8 @@ static void test_builds_in_a_row_are_balanced(void)
       hook_scene(&s, 0, 200u + 300u * (uint32_t)(i % 3));
       g = scene_geometry(&s);
       CHECK(trbvh_build(&bvh, &g, &o) == TRBVH_OK);
-      CHECK_MSG(c.live == 1 && c.live_bytes == bvh.block_size && c.bad_frees == 0, "%u live, %zu bytes, block_size %zu", c.live, c.live_bytes, bvh.block_size);
+      CHECK_MSG(c.live == 1 && c.live_bytes == bvh.block_size && c.bad_frees == 0, "%u live, %zu bytes, block_size %zu",
+          c.live, c.live_bytes, bvh.block_size);
       CHECK(bvh.allocator.alloc == counter_alloc && bvh.allocator.user == &c);
       scene_free(&s);
     }
@@ -165,7 +169,8 @@ static void test_cancel_at_every_tick(void)
         o.jobs.width = (uint32_t)width;
         ticks_start(&all, 0);
         CHECK(trbvh_build(&whole, &g, &o) == TRBVH_OK);
-        CHECK_MSG(!all.backwards && !all.outside && !all.foreign, "%u ticks backwards, %u outside 0..1, %u on other threads", all.backwards, all.outside, all.foreign);
+        CHECK_MSG(!all.backwards && !all.outside && !all.foreign,
+            "%u ticks backwards, %u outside 0..1, %u on other threads", all.backwards, all.outside, all.foreign);
         if (s.count > 100) CHECK_MSG(all.count >= 3, "%u ticks", all.count);
         if (s.count > 100) CHECK_MSG(all.last > 0.5f, "the last tick says %g", (double)all.last);
         step = 1 + all.count / 60;
@@ -183,7 +188,8 @@ static void test_cancel_at_every_tick(void)
             o.progress_user = &t;
             o.allocator = counter_allocator(&c);
             o.stats = &stats;
-            CONTEXT("scene %s, preset %s, width %d, rebuilt %u, cancelled at tick %u of %u", s.name, preset_names[preset], width, rebuilt, n, all.count);
+            CONTEXT("scene %s, preset %s, width %d, rebuilt %u, cancelled at tick %u of %u", s.name,
+                preset_names[preset], width, rebuilt, n, all.count);
             if (rebuilt) {
               CHECK(trbvh_build(&bvh, &g, &o) == TRBVH_OK);
               CHECK_MSG(t.count == all.count, "%u ticks, %u the first time", t.count, all.count);
@@ -352,10 +358,13 @@ static void test_jobs_do_not_change_the_tree(void)
           result = trbvh_build(&bvh, &g, &o);
           CHECK_MSG(result == TRBVH_OK, "%s", trbvh_result_text(result));
           CHECK_MSG(same_tree(&bvh, &want), "another tree than without jobs");
-          CHECK_MSG(c.peak_bytes <= bound + scratch && c.allocs <= 2, "peak %zu, bounds %zu and %zu, %u allocations", c.peak_bytes, bound, scratch, c.allocs);
-          CHECK_MSG(fabs(stats.sah_cost - first.sah_cost) <= 0 && stats.max_depth == first.max_depth && stats.leaf_count == first.leaf_count, "stats differ");
+          CHECK_MSG(c.peak_bytes <= bound + scratch && c.allocs <= 2, "peak %zu, bounds %zu and %zu, %u allocations",
+              c.peak_bytes, bound, scratch, c.allocs);
+          CHECK_MSG(fabs(stats.sah_cost - first.sah_cost) <= 0 && stats.max_depth == first.max_depth
+              && stats.leaf_count == first.leaf_count, "stats differ");
           CHECK_MSG(!log.nested && !log.running, "%u nested calls of parallel_for", log.nested);
-          CHECK_MSG(!t.backwards && !t.outside && !t.foreign, "%u ticks backwards, %u outside 0..1, %u on other threads", t.backwards, t.outside, t.foreign);
+          CHECK_MSG(!t.backwards && !t.outside && !t.foreign,
+              "%u ticks backwards, %u outside 0..1, %u on other threads", t.backwards, t.outside, t.foreign);
           if (systems[system].run && log.most > 1) used = 1;
           trbvh_free(&bvh);
           CHECK_MSG(c.live == 0 && c.bad_frees == 0, "%u live, %u bad frees", c.live, c.bad_frees);
@@ -394,10 +403,12 @@ static void test_cancel_with_jobs(void)
       o.allocator = counter_allocator(&c);
       CONTEXT("%s, cancelled at tick %u", systems[system].name, n);
       result = trbvh_build(&bvh, &g, &o);
-      CHECK_MSG(result == (t.count >= n ? TRBVH_CANCELLED : TRBVH_OK), "%s after %u ticks", trbvh_result_text(result), t.count);
+      CHECK_MSG(result == (t.count >= n ? TRBVH_CANCELLED : TRBVH_OK), "%s after %u ticks", trbvh_result_text(result),
+          t.count);
       CHECK((result == TRBVH_OK) != tree_is_empty(&bvh));
       trbvh_free(&bvh);
-      CHECK_MSG(c.live == 0 && c.bad_frees == 0 && !t.after_cancel, "%u live, %u bad frees, %u ticks after the cancel", c.live, c.bad_frees, t.after_cancel);
+      CHECK_MSG(c.live == 0 && c.bad_frees == 0 && !t.after_cancel, "%u live, %u bad frees, %u ticks after the cancel",
+          c.live, c.bad_frees, t.after_cancel);
       if (t.count < n) break;
     }
   scene_free(&s);
@@ -412,7 +423,8 @@ static void test_queries_on_jobs(void)
   trbvh bvh;
   rng r = {77};
   trbvh_ray *rays = (trbvh_ray *)xmalloc(sizeof(trbvh_ray) * 5003);
-  trbvh_hit *want = (trbvh_hit *)xmalloc(sizeof(trbvh_hit) * 5003), *hits = (trbvh_hit *)xmalloc(sizeof(trbvh_hit) * 5004);
+  trbvh_hit *want = (trbvh_hit *)xmalloc(sizeof(trbvh_hit) * 5003);
+  trbvh_hit *hits = (trbvh_hit *)xmalloc(sizeof(trbvh_hit) * 5004);
   uint8_t *any = (uint8_t *)xmalloc(5004);
   unsigned hit_count = 0;
   int k;
@@ -422,7 +434,10 @@ static void test_queries_on_jobs(void)
   CHECK(trbvh_build(&bvh, &g, NULL) == TRBVH_OK);
   for (i = 0; i < 5003; ++i) {
     memset(&rays[i], 0, sizeof rays[i]);
-    for (k = 0; k < 3; ++k) { rays[i].origin[k] = rng_range(&r, -2, 2); rays[i].dir[k] = rng_range(&r, -0.5f, 0.5f) - rays[i].origin[k]; }
+    for (k = 0; k < 3; ++k) {
+      rays[i].origin[k] = rng_range(&r, -2, 2);
+      rays[i].dir[k] = rng_range(&r, -0.5f, 0.5f) - rays[i].origin[k];
+    }
     if (i % 3 == 0) rays[i].tmax = rng_unit(&r);
     memset(&want[i], 0, sizeof want[i]);
     hit_count += (unsigned)trbvh_intersect(&bvh, &rays[i], &want[i]);
@@ -448,7 +463,8 @@ static void test_queries_on_jobs(void)
         CHECK_MSG(wrong == 0, "%u of occluded are wrong", wrong);
         CHECK(any[counts[n]] == 0x77);
         CHECK_MSG(!log.nested, "%u nested calls of parallel_for", log.nested);
-        if (systems[system].run && widths[w] > 1 && counts[n] == 5003) CHECK_MSG(log.most > 1, "5003 rays as %u jobs", log.most);
+        if (systems[system].run && widths[w] > 1 && counts[n] == 5003)
+          CHECK_MSG(log.most > 1, "5003 rays as %u jobs", log.most);
       }
   CONTEXT("no options");
   memset(hits, 0x77, sizeof(trbvh_hit) * 5004);

@@ -25,7 +25,8 @@ static void input_free(input *in) { scene_free(&in->s); free(in->indices); free(
 
 static int tree_is_empty(const trbvh *b)
 {
-  return !b->nodes && !b->prims && !b->triangles && !b->wide && !b->node_count && !b->ref_count && !b->prim_count && !b->block && !b->block_size;
+  return !b->nodes && !b->prims && !b->triangles && !b->wide && !b->node_count && !b->ref_count && !b->prim_count
+      && !b->block && !b->block_size;
 }
 
 /* The build must fail with this result, on a zeroed tree and on a built one; word: part of the message, or NULL. */
@@ -49,18 +50,24 @@ static void expect(input *in, trbvh_result want, const char *word)
     }
     memset(&in->stats, 0x33, sizeof in->stats);
     got = trbvh_build(&bvh, &in->g, &in->o);
-    CHECK_MSG(got == want, "%s tree: got %d (%s), want %d", rebuilt ? "built" : "zeroed", (int)got, trbvh_result_text(got), (int)want);
+    CHECK_MSG(got == want, "%s tree: got %d (%s), want %d", rebuilt ? "built" : "zeroed", (int)got,
+        trbvh_result_text(got), (int)want);
     if (in->o.stats && got) {
-      CHECK_MSG(memchr(in->stats.message, 0, sizeof in->stats.message) && in->stats.message[0] && in->stats.message[0] != 0x33, "no message");
-      if (word && memchr(in->stats.message, 0, sizeof in->stats.message)) CHECK_MSG(strstr(in->stats.message, word) != NULL, "the message \"%s\" does not say \"%s\"", in->stats.message, word);
-      CHECK(in->stats.node_count == 0 && in->stats.leaf_count == 0 && in->stats.ref_count == 0 && in->stats.on_device == 0);
+      CHECK_MSG(memchr(in->stats.message, 0, sizeof in->stats.message) && in->stats.message[0]
+          && in->stats.message[0] != 0x33, "no message");
+      if (word && memchr(in->stats.message, 0, sizeof in->stats.message))
+        CHECK_MSG(strstr(in->stats.message, word) != NULL, "the message \"%s\" does not say \"%s\"",
+            in->stats.message, word);
+      CHECK(in->stats.node_count == 0 && in->stats.leaf_count == 0 && in->stats.ref_count == 0
+          && in->stats.on_device == 0);
     }
     if (got) {
       CHECK(tree_is_empty(&bvh));
       CHECK_MSG(in->memory.live == 0, "%u blocks leaked", in->memory.live);
     }
     trbvh_free(&bvh);
-    CHECK_MSG(in->memory.live == 0 && in->memory.bad_frees == 0, "%u blocks live, %u bad frees", in->memory.live, in->memory.bad_frees);
+    CHECK_MSG(in->memory.live == 0 && in->memory.bad_frees == 0, "%u blocks live, %u bad frees", in->memory.live,
+        in->memory.bad_frees);
   }
 }
 
@@ -391,7 +398,8 @@ static void test_result_texts(void)
   for (i = 0; i < TRBVH_RESULT_COUNT; ++i) {
     const char *text = trbvh_result_text((trbvh_result)i);
     CHECK_MSG(text && text[0], "result %d", i);
-    for (j = 0; text && j < i; ++j) CHECK_MSG(strcmp(text, trbvh_result_text((trbvh_result)j)), "results %d and %d: %s", i, j, text);
+    for (j = 0; text && j < i; ++j)
+      CHECK_MSG(strcmp(text, trbvh_result_text((trbvh_result)j)), "results %d and %d: %s", i, j, text);
   }
   for (i = 0; i < (int)(sizeof odd / sizeof odd[0]); ++i) {
     trbvh_result r;
@@ -410,9 +418,11 @@ static void test_device_without_backend(void)
   memset(&bvh, 0, sizeof bvh);
   input_make(&in);
   in.o.device = (trbvh_device *)(void *)&anything;
-  CHECK(trbvh_build(&bvh, &in.g, &in.o) == TRBVH_OK && bvh.node_count > 0 && in.stats.on_device == 0 && in.stats.message[0]);
+  CHECK(trbvh_build(&bvh, &in.g, &in.o) == TRBVH_OK && bvh.node_count > 0 && in.stats.on_device == 0
+      && in.stats.message[0]);
   in.o.flags = TRBVH_NO_FALLBACK;
-  CHECK(trbvh_build(&bvh, &in.g, &in.o) == TRBVH_NO_DEVICE && tree_is_empty(&bvh) && in.stats.message[0] && in.memory.live == 0);
+  CHECK(trbvh_build(&bvh, &in.g, &in.o) == TRBVH_NO_DEVICE && tree_is_empty(&bvh) && in.stats.message[0]
+      && in.memory.live == 0);
   trbvh_free(&bvh);
   input_free(&in);
 }

@@ -5,7 +5,7 @@
 #include "test.h"
 #include "scenes.h"
 
-// >>reference ---- every triangle, in double, with a bound on what float arithmetic may make of it ---------------------
+// >>reference ---- every triangle, in double, with a bound on what float arithmetic may make of it --------------------
 typedef struct reference {
   double t, u, v;
   double error_t, error_uv;       /* how far a careful float implementation may be off; t in lengths of dir */
@@ -15,7 +15,8 @@ typedef struct reference {
 static void reference_triangle(const float *v, const trbvh_ray *ray, reference *r)
 {
   const double eps = FLT_EPSILON;
-  double p[3][3], d[3], e[3][3], length = 0, big = 0, edge = 0, w[3], det, t, margin, tmin = ray->tmin > 0 ? (double)ray->tmin : 0.0;
+  double p[3][3], d[3], e[3][3], length = 0, big = 0, edge = 0, w[3], det, t, margin;
+  double tmin = ray->tmin > 0 ? (double)ray->tmin : 0.0;
   double tmax = ray->tmax > 0 || ray->tmax < 0 ? (double)ray->tmax : DBL_MAX, along[3];
   int i, k;
   for (k = 0; k < 3; ++k) { d[k] = ray->dir[k]; length += d[k] * d[k]; }
@@ -42,7 +43,10 @@ static void reference_triangle(const float *v, const trbvh_ray *ray, reference *
   det = w[0] + w[1] + w[2];
   memset(r, 0, sizeof *r);
   r->error_uv = r->error_t = DBL_MAX;
-  if (!memcmp(v, v + 3, 12) || !memcmp(v, v + 6, 12) || !memcmp(v + 3, v + 6, 12)) { r->out = 1; return; }    /* no area */
+  if (!memcmp(v, v + 3, 12) || !memcmp(v, v + 6, 12) || !memcmp(v + 3, v + 6, 12)) {       /* no area */
+    r->out = 1;
+    return;
+  }
   if (!(fabs(det) > 0)) {                        /* seen edge-on */
     r->out = fabs(w[0]) + fabs(w[1]) + fabs(w[2]) > 64 * eps * big * edge;
     return;
@@ -61,7 +65,8 @@ static void reference_triangle(const float *v, const trbvh_ray *ray, reference *
 }
 
 /* Compares one ray with brute force. Returns 1 when rounding decides which triangle is hit. */
-static int check_ray(const float *corners, uint32_t count, const trbvh_ray *ray, int got, const trbvh_hit *hit, const char *what)
+static int check_ray(const float *corners, uint32_t count, const trbvh_ray *ray, int got, const trbvh_hit *hit,
+    const char *what)
 {
   double nearest = DBL_MAX, farthest_start = DBL_MAX;
   uint32_t i, sure_prim = TRBVH_NONE;
@@ -78,21 +83,33 @@ static int check_ray(const float *corners, uint32_t count, const trbvh_ray *ray,
   ambiguous = farthest_start < nearest;
   if (!got) {
     CHECK_MSG(sure_prim == TRBVH_NONE, "%s: a miss, but triangle %u is hit at t <= %g", what, sure_prim, nearest);
-    CHECK_MSG(hit->prim == TRBVH_NONE && hit->instance == TRBVH_NONE && fabs((double)hit->u) + fabs((double)hit->v) <= 0, "%s: a miss reported as prim %u, u %g, v %g", what, hit->prim, (double)hit->u, (double)hit->v);
-    CHECK_MSG(ray->tmax < 0 || (ray->tmax > 0 && ray->tmax <= FLT_MAX ? hit->t >= ray->tmax && hit->t <= ray->tmax : hit->t >= FLT_MAX), "%s: a miss reported at t %g, limit %g", what, (double)hit->t, (double)ray->tmax);
+    CHECK_MSG(hit->prim == TRBVH_NONE && hit->instance == TRBVH_NONE
+        && fabs((double)hit->u) + fabs((double)hit->v) <= 0, "%s: a miss reported as prim %u, u %g, v %g", what,
+        hit->prim, (double)hit->u, (double)hit->v);
+    if (ray->tmax > 0 && ray->tmax <= FLT_MAX)
+      CHECK_MSG(hit->t >= ray->tmax && hit->t <= ray->tmax, "%s: a miss reported at t %g, limit %g", what,
+          (double)hit->t, (double)ray->tmax);
+    else if (!(ray->tmax < 0))
+      CHECK_MSG(hit->t >= FLT_MAX, "%s: a miss reported at t %g, no limit", what, (double)hit->t);
     return ambiguous;
   }
   CHECK_MSG(hit->prim < count, "%s: hit on %u of %u", what, hit->prim, count);
   if (hit->prim >= count) return ambiguous;
   CHECK_MSG(hit->instance == TRBVH_NONE, "%s: instance %u", what, hit->instance);
-  CHECK_MSG(!own.out, "%s: hit on triangle %u, which the ray misses: t %g, u %g, v %g; in double %g, %g, %g", what, hit->prim, (double)hit->t, (double)hit->u, (double)hit->v, own.t, own.u, own.v);
+  CHECK_MSG(!own.out, "%s: hit on triangle %u, which the ray misses: t %g, u %g, v %g; in double %g, %g, %g", what,
+      hit->prim, (double)hit->t, (double)hit->u, (double)hit->v, own.t, own.u, own.v);
   if (own.error_uv < 0.25) {
-    CHECK_MSG(fabs(hit->t - own.t) <= own.error_t, "%s: t %.9g, in double %.9g +- %g", what, (double)hit->t, own.t, own.error_t);
-    CHECK_MSG(fabs(hit->u - own.u) <= own.error_uv && fabs(hit->v - own.v) <= own.error_uv, "%s: u %g, v %g; in double %g, %g +- %g", what, (double)hit->u, (double)hit->v, own.u, own.v, own.error_uv);
-    CHECK_MSG(hit->t - own.error_t <= nearest, "%s: hit at %g, but triangle %u is hit at t <= %g", what, (double)hit->t, sure_prim, nearest);
+    CHECK_MSG(fabs(hit->t - own.t) <= own.error_t, "%s: t %.9g, in double %.9g +- %g", what, (double)hit->t, own.t,
+        own.error_t);
+    CHECK_MSG(fabs(hit->u - own.u) <= own.error_uv && fabs(hit->v - own.v) <= own.error_uv,
+        "%s: u %g, v %g; in double %g, %g +- %g", what, (double)hit->u, (double)hit->v, own.u, own.v, own.error_uv);
+    CHECK_MSG(hit->t - own.error_t <= nearest, "%s: hit at %g, but triangle %u is hit at t <= %g", what, (double)hit->t,
+        sure_prim, nearest);
   }
-  CHECK_MSG(hit->u >= -1e-6f && hit->v >= -1e-6f && hit->u + hit->v <= 1 + 1e-6f, "%s: u %g, v %g", what, (double)hit->u, (double)hit->v);
-  CHECK_MSG((ray->tmin < 0 ? hit->t > 0 : hit->t > ray->tmin) && (!(ray->tmax > 0) || hit->t <= ray->tmax), "%s: t %.9g outside %.9g .. %.9g", what, (double)hit->t, (double)ray->tmin, (double)ray->tmax);
+  CHECK_MSG(hit->u >= -1e-6f && hit->v >= -1e-6f && hit->u + hit->v <= 1 + 1e-6f, "%s: u %g, v %g", what,
+      (double)hit->u, (double)hit->v);
+  CHECK_MSG((ray->tmin < 0 ? hit->t > 0 : hit->t > ray->tmin) && (!(ray->tmax > 0) || hit->t <= ray->tmax),
+      "%s: t %.9g outside %.9g .. %.9g", what, (double)hit->t, (double)ray->tmin, (double)ray->tmax);
   return ambiguous;
 }
 
@@ -150,8 +167,10 @@ static void point_on_triangle(float *p, const mesh *m, rng *r)
   for (k = 0; k < 3; ++k) p[k] = v[k] + f * (v[3 + k] - v[k]) + h * (v[6 + k] - v[k]);
 }
 
-enum { RAYS_RANDOM, RAYS_AXIS, RAYS_AXIS_AT_VERTEX, RAYS_PLANE, RAYS_FAR, RAYS_AT_SURFACE, RAYS_FROM_SURFACE, RAYS_FROM_VERTEX, RAYS_GRAZING, RAYS_WINDOW, RAYS_SCALED_DIR, RAY_KINDS };
-static const char *const ray_kinds[RAY_KINDS] = {"random", "axis-parallel", "axis-parallel through a vertex", "with one zero", "from far away", "at a surface point",
+enum { RAYS_RANDOM, RAYS_AXIS, RAYS_AXIS_AT_VERTEX, RAYS_PLANE, RAYS_FAR, RAYS_AT_SURFACE, RAYS_FROM_SURFACE,
+    RAYS_FROM_VERTEX, RAYS_GRAZING, RAYS_WINDOW, RAYS_SCALED_DIR, RAY_KINDS };
+static const char *const ray_kinds[RAY_KINDS] = {"random", "axis-parallel", "axis-parallel through a vertex",
+    "with one zero", "from far away", "at a surface point",
   "from a surface point", "from a vertex", "grazing", "in a window", "of any length"};
 
 static void make_ray(trbvh_ray *ray, int kind, const mesh *m, rng *r)
@@ -201,12 +220,20 @@ static void make_ray(trbvh_ray *ray, int kind, const mesh *m, rng *r)
     for (k = 0; k < 3; ++k) ray->dir[k] *= f;
   }
 }
+static const char *ray_text(const trbvh_ray *r)
+{
+  static char text[160];
+  snprintf(text, sizeof text, "(%.9g %.9g %.9g) %.9g, (%.9g %.9g %.9g) %.9g", (double)r->origin[0], (double)r->origin[1],
+      (double)r->origin[2], (double)r->tmin, (double)r->dir[0], (double)r->dir[1], (double)r->dir[2], (double)r->tmax);
+  return text;
+}
 static int has_direction(const trbvh_ray *ray)
 {
   return fabs((double)ray->dir[0]) + fabs((double)ray->dir[1]) + fabs((double)ray->dir[2]) > 0;
 }
 
-static const char *const ordinary[] = {"random", "sphere", "rock", "room", "terrain", "slivers", "city", "huge_and_tiny", "grid", "flat_y", "not_finite", "identical", "collinear"};
+static const char *const ordinary[] = {"random", "sphere", "rock", "room", "terrain", "slivers", "city",
+    "huge_and_tiny", "grid", "flat_y", "not_finite", "identical", "collinear"};
 #define ORDINARY_COUNT (sizeof ordinary / sizeof ordinary[0])
 
 static uint32_t finite_count(mesh *m)             /* brute force must not see what the build skips: mark those */
@@ -245,7 +272,7 @@ static void test_against_brute_force(void)
         int got;
         make_ray(&ray, kind, &m, &r);
         if (!has_direction(&ray)) continue;
-        CONTEXT("scene %s, ray %u %s: (%.9g %.9g %.9g) %.9g, (%.9g %.9g %.9g) %.9g", ordinary[at], n, ray_kinds[kind], (double)ray.origin[0], (double)ray.origin[1], (double)ray.origin[2], (double)ray.tmin, (double)ray.dir[0], (double)ray.dir[1], (double)ray.dir[2], (double)ray.tmax);
+        CONTEXT("scene %s, ray %u %s: %s", ordinary[at], n, ray_kinds[kind], ray_text(&ray));
         if (!is_finite(ray.origin[0] + ray.origin[1] + ray.origin[2] + ray.dir[0] + ray.dir[1] + ray.dir[2])) continue;
         memset(&hit, 0x55, sizeof hit);
         got = trbvh_intersect(&bvh[1], &ray, &hit);
@@ -254,15 +281,21 @@ static void test_against_brute_force(void)
         hits += (unsigned)got;
         for (preset = 0; preset < 3; ++preset) {
           memset(&other, 0x66, sizeof other);
-          CHECK_MSG(trbvh_intersect(&bvh[preset], &ray, &other) == got && same_hit(&hit, &other), "preset %s hits %u at %.9g (%g, %g), MEDIUM %u at %.9g (%g, %g)", preset_names[preset],
-            other.prim, (double)other.t, (double)other.u, (double)other.v, hit.prim, (double)hit.t, (double)hit.u, (double)hit.v);
-          CHECK_MSG(trbvh_occluded(&bvh[preset], &ray) == got, "preset %s: occluded is not %d", preset_names[preset], got);
+          CHECK_MSG(trbvh_intersect(&bvh[preset], &ray, &other) == got && same_hit(&hit, &other),
+              "preset %s hits %u at %.9g (%g, %g), MEDIUM %u at %.9g (%g, %g)", preset_names[preset],
+              other.prim, (double)other.t, (double)other.u, (double)other.v,
+              hit.prim, (double)hit.t, (double)hit.u, (double)hit.v);
+          CHECK_MSG(trbvh_occluded(&bvh[preset], &ray) == got, "preset %s: occluded is not %d", preset_names[preset],
+              got);
         }
       }
       CONTEXT("scene %s, %s rays", ordinary[at], ray_kinds[kind]);
-      if (kind == RAYS_RANDOM) CHECK_MSG(ambiguous * 50 <= rays, "%u of %u rays are decided by rounding: the reference is too weak", ambiguous, rays);
-      if (kind == RAYS_WINDOW) CHECK_MSG(ambiguous * 20 <= rays, "%u of %u rays are decided by rounding: the reference is too weak", ambiguous, rays);
-      if (kind == RAYS_AT_SURFACE && strcmp(ordinary[at], "not_finite")) CHECK_MSG(hits * 10 >= rays * 9, "%u of %u rays at the surface hit it", hits, rays);
+      if (kind == RAYS_RANDOM)
+        CHECK_MSG(ambiguous * 50 <= rays, "%u of %u rays are decided by rounding: the reference is too weak", ambiguous, rays);
+      if (kind == RAYS_WINDOW)
+        CHECK_MSG(ambiguous * 20 <= rays, "%u of %u rays are decided by rounding: the reference is too weak", ambiguous, rays);
+      if (kind == RAYS_AT_SURFACE && strcmp(ordinary[at], "not_finite"))
+        CHECK_MSG(hits * 10 >= rays * 9, "%u of %u rays at the surface hit it", hits, rays);
     }
     for (preset = 0; preset < 3; ++preset) trbvh_free(&bvh[preset]);
     mesh_free(&m);
@@ -325,16 +358,19 @@ static void test_hits_do_not_depend_on_the_tree(void)
             if (want.prim == TRBVH_NONE || hit.t < want.t) { want = hit; want.prim = i; }
           } else limit = hit.t;
         if (want.prim == TRBVH_NONE) { want.t = limit; want.instance = TRBVH_NONE; }
-        CONTEXT("scene %s, ray %u %s: (%.9g %.9g %.9g) %.9g, (%.9g %.9g %.9g) %.9g", m.s.name, n, ray_kinds[kind], (double)ray.origin[0], (double)ray.origin[1], (double)ray.origin[2], (double)ray.tmin, (double)ray.dir[0], (double)ray.dir[1], (double)ray.dir[2], (double)ray.tmax);
+        CONTEXT("scene %s, ray %u %s: %s", m.s.name, n, ray_kinds[kind], ray_text(&ray));
         for (preset = 0; preset <= PRESET_COUNT; ++preset) {
           int got = trbvh_intersect(&bvh[preset], &ray, &hit);
           if (scene_defs[at].flags & SCENE_EXTREME) {
-            CHECK_MSG(got ? hit.prim < m.s.count && hit.t > ray.tmin && !(ray.tmax > 0 && hit.t > ray.tmax) : hit.prim == TRBVH_NONE, "tree %d hits %u at %.9g", preset, hit.prim, (double)hit.t);
+            int fits = hit.prim < m.s.count && hit.t > ray.tmin && !(ray.tmax > 0 && hit.t > ray.tmax);
+            CHECK_MSG(got ? fits : hit.prim == TRBVH_NONE, "tree %d hits %u at %.9g", preset, hit.prim, (double)hit.t);
             CHECK(trbvh_occluded(&bvh[preset], &ray) == got);
             continue;
           }
-          CHECK_MSG(same_hit(&hit, &want) && got == (want.prim != TRBVH_NONE), "tree %d hits %u at %.9g (%g, %g), the triangle alone: %u at %.9g (%g, %g)", preset,
-            hit.prim, (double)hit.t, (double)hit.u, (double)hit.v, want.prim, (double)want.t, (double)want.u, (double)want.v);
+          CHECK_MSG(same_hit(&hit, &want) && got == (want.prim != TRBVH_NONE),
+              "tree %d hits %u at %.9g (%g, %g), the triangle alone: %u at %.9g (%g, %g)", preset,
+              hit.prim, (double)hit.t, (double)hit.u, (double)hit.v,
+              want.prim, (double)want.t, (double)want.u, (double)want.v);
           CHECK_MSG(trbvh_occluded(&bvh[preset], &ray) == (want.prim != TRBVH_NONE), "tree %d: occluded", preset);
         }
       }
@@ -400,16 +436,18 @@ static void test_watertight_from_inside(void)
         for (b = 0; b < 2; ++b)
           if (!trbvh_intersect(&bvh[b], &ray, &hit)) {
             if (!leaks[b]++) {
-              CONTEXT("case %u: %s of %u, centre (%g %g %g), preset %s, ray (%.9g %.9g %.9g), (%.9g %.9g %.9g)", c, cases[c].scene, m.s.count, (double)cases[c].x, (double)cases[c].y, (double)cases[c].z, b ? "HIGH" : "MEDIUM",
-                (double)origin[0], (double)origin[1], (double)origin[2], (double)ray.dir[0], (double)ray.dir[1], (double)ray.dir[2]);
+              CONTEXT("case %u: %s of %u, centre (%g %g %g), preset %s, ray %s", c, cases[c].scene, m.s.count,
+                  (double)cases[c].x, (double)cases[c].y, (double)cases[c].z, b ? "HIGH" : "MEDIUM", ray_text(&ray));
               CHECK_MSG(0, "a ray slips through");
             }
           }
         dark += !trbvh_occluded(&bvh[0], &ray);
       }
     }
-    CONTEXT("case %u: %s of %u, centre (%g %g %g)", c, cases[c].scene, m.s.count, (double)cases[c].x, (double)cases[c].y, (double)cases[c].z);
-    CHECK_MSG(leaks[0] == 0 && leaks[1] == 0 && dark == 0, "%u rays: %u slip through with MEDIUM, %u with HIGH, %u through occluded", rays, leaks[0], leaks[1], dark);
+    CONTEXT("case %u: %s of %u, centre (%g %g %g)", c, cases[c].scene, m.s.count, (double)cases[c].x,
+        (double)cases[c].y, (double)cases[c].z);
+    CHECK_MSG(leaks[0] == 0 && leaks[1] == 0 && dark == 0,
+        "%u rays: %u slip through with MEDIUM, %u with HIGH, %u through occluded", rays, leaks[0], leaks[1], dark);
     trbvh_free(&bvh[0]);
     trbvh_free(&bvh[1]);
     mesh_free(&m);
@@ -438,14 +476,15 @@ static void test_watertight_from_outside(void)
         trbvh_ray ray;
         trbvh_hit hit;
         float target[3];
-        double facing = 0, length = 0, out;
+        double facing = 0, length = 0, out, aside;
         int k, b;
         memset(&ray, 0, sizeof ray);
         if (i % 2) point_on_edge(target, &m, &r);
         else memcpy(target, random_corner(&m, &r), sizeof target);
         for (k = 0; k < 3; ++k) {
           out = (double)target[k] - (double)centres[c][k];                /* the normal, about */
-          ray.origin[k] = (float)((double)centres[c][k] + out * distances[d] + (double)rng_range(&r, -0.3f, 0.3f) * (distances[d] - 1));
+          aside = (double)rng_range(&r, -0.3f, 0.3f) * (distances[d] - 1);
+          ray.origin[k] = (float)((double)centres[c][k] + out * distances[d] + aside);
           ray.dir[k] = target[k] - ray.origin[k];
           facing -= out * ray.dir[k];
           length += (double)ray.dir[k] * ray.dir[k];
@@ -456,7 +495,8 @@ static void test_watertight_from_outside(void)
           if (!trbvh_intersect(&bvh[b], &ray, &hit)) ++leaks;
           else if (hit.t * sqrt(length) > sqrt(length) + 0.5) ++back;      /* slipped in, and hit the far side */
       }
-      CONTEXT("sphere at (%g %g %g) from distance %g", (double)centres[c][0], (double)centres[c][1], (double)centres[c][2], (double)distances[d]);
+      CONTEXT("sphere at (%g %g %g) from distance %g", (double)centres[c][0], (double)centres[c][1],
+          (double)centres[c][2], (double)distances[d]);
       CHECK_MSG(leaks == 0 && back == 0 && rays > 500, "%u rays: %u miss, %u hit the far side", rays, leaks, back);
       trbvh_free(&bvh[0]);
       trbvh_free(&bvh[1]);
@@ -491,7 +531,8 @@ static void test_power_of_two_scales(void)
         CHECK(trbvh_build(&b, &big.g, &o) == TRBVH_OK);
         CONTEXT("scene %s times 2^%d, preset %s", names[at], exponents[e], preset_names[preset]);
         if (preset < 2 || exponents[e] % 3 == 0)     /* split priorities are cube roots: exact for every third power */
-          CHECK_MSG(a.node_count == b.node_count && a.ref_count == b.ref_count && same_bits(a.prims, b.prims, sizeof(uint32_t) * a.ref_count), "the trees differ");
+          CHECK_MSG(a.node_count == b.node_count && a.ref_count == b.ref_count
+              && same_bits(a.prims, b.prims, sizeof(uint32_t) * a.ref_count), "the trees differ");
         for (n = 0; n < QUICK_OR(200, 3000); ++n) {
           trbvh_ray ray, with, without;                /* with: dir scaled too, so that t stays */
           trbvh_hit hit, hit_with, hit_without;
@@ -550,7 +591,7 @@ static void test_other_scales(void)
           ray.origin[k] *= scales[i];
           if (n % 4 < 2) ray.dir[k] *= scales[i];
         }
-        CONTEXT("scene %s times %g, ray (%.9g %.9g %.9g), (%.9g %.9g %.9g)", names[at], (double)scales[i], (double)ray.origin[0], (double)ray.origin[1], (double)ray.origin[2], (double)ray.dir[0], (double)ray.dir[1], (double)ray.dir[2]);
+        CONTEXT("scene %s times %g, ray %s", names[at], (double)scales[i], ray_text(&ray));
         got = trbvh_intersect(&bvh, &ray, &hit);
         hits += (unsigned)got;
         ambiguous += (unsigned)check_ray(big.corners, big.s.count, &ray, got, &hit, "intersect");
@@ -593,7 +634,7 @@ static void test_window_is_exact(void)
       unsigned found = 0, must = 0, may = 0;
       uint32_t i;
       make_ray(&ray, RAYS_RANDOM, &m, &r);
-      CONTEXT("scene %s, ray (%.9g %.9g %.9g), (%.9g %.9g %.9g)", names[at], (double)ray.origin[0], (double)ray.origin[1], (double)ray.origin[2], (double)ray.dir[0], (double)ray.dir[1], (double)ray.dir[2]);
+      CONTEXT("scene %s, ray %s", names[at], ray_text(&ray));
       for (i = 0; i < m.s.count; ++i) {
         reference ref;
         reference_triangle(m.corners + 9 * i, &ray, &ref);
@@ -605,21 +646,25 @@ static void test_window_is_exact(void)
         ++found;
         CHECK_MSG(hit.t > cut.tmin, "t %.9g, tmin %.9g", (double)hit.t, (double)cut.tmin);
         cut.tmax = hit.t;
-        CHECK_MSG(trbvh_intersect(&bvh, &cut, &again) && same_hit(&hit, &again), "tmax = t: %u at %.9g, was %u at %.9g", again.prim, (double)again.t, hit.prim, (double)hit.t);
+        CHECK_MSG(trbvh_intersect(&bvh, &cut, &again) && same_hit(&hit, &again), "tmax = t: %u at %.9g, was %u at %.9g",
+            again.prim, (double)again.t, hit.prim, (double)hit.t);
         CHECK(trbvh_occluded(&bvh, &cut));
         cut.tmax = step(hit.t, 0);
-        CHECK_MSG(!trbvh_intersect(&bvh, &cut, &again) && again.t >= cut.tmax && again.t <= cut.tmax, "tmax below t: %u at %.9g, nearest was %.9g", again.prim, (double)again.t, (double)hit.t);
+        CHECK_MSG(!trbvh_intersect(&bvh, &cut, &again) && again.t >= cut.tmax && again.t <= cut.tmax,
+            "tmax below t: %u at %.9g, nearest was %.9g", again.prim, (double)again.t, (double)hit.t);
         CHECK(!trbvh_occluded(&bvh, &cut));
         cut.tmax = 0;
         cut.tmin = step(hit.t, 0);
-        CHECK_MSG(trbvh_intersect(&bvh, &cut, &again) && same_hit(&hit, &again), "tmin below t: %u at %.9g, was %u at %.9g", again.prim, (double)again.t, hit.prim, (double)hit.t);
+        CHECK_MSG(trbvh_intersect(&bvh, &cut, &again) && same_hit(&hit, &again),
+            "tmin below t: %u at %.9g, was %u at %.9g", again.prim, (double)again.t, hit.prim, (double)hit.t);
         cut.tmin = hit.t;
       }
       CHECK_MSG(found <= may && found + 3 >= must, "%u hits along the ray, %u at least, %u at most", found, must, may);
       total += found; sure += must; maybe += may;
     }
     CONTEXT("scene %s", names[at]);
-    CHECK_MSG(total > 0 && total <= maybe && total * 1000 >= sure * 990, "%lu hits, %lu surely, %lu at most", total, sure, maybe);
+    CHECK_MSG(total > 0 && total <= maybe && total * 1000 >= sure * 990, "%lu hits, %lu surely, %lu at most", total,
+        sure, maybe);
     trbvh_free(&bvh);
     mesh_free(&m);
   }
@@ -629,8 +674,10 @@ static void test_meaning_of_tmin_and_tmax(void)
 {
   static const float corners[18] = {-1, -1, 2,  1, -1, 2,  0, 2, 2,   -1, -1, 4,  1, -1, 4,  0, 2, 4};
   static const struct { float tmin, tmax, scale; int hit; float t; unsigned prim; } cases[] = {
-    {0, 0, 1, 1, 2, 0}, {0, 1, 1, 0, 1, 0}, {0, 2, 1, 1, 2, 0}, {2, 0, 1, 1, 4, 1}, {1.9f, 0, 1, 1, 2, 0}, {2, 3, 1, 0, 3, 0}, {2, 4, 1, 1, 4, 1}, {4, 0, 1, 0, FLT_MAX, 0},
-    {-5, 0, 1, 1, 2, 0}, {-5, 1.5f, 1, 0, 1.5f, 0}, {0, FLT_MAX, 1, 1, 2, 0}, {0, 0, 0.5f, 1, 4, 0}, {0, 3.9f, 0.5f, 0, 3.9f, 0}, {0, 0, 4, 1, 0.5f, 0}, {0.5f, 0.9f, 4, 0, 0.9f, 0}, {0.5f, 1, 4, 1, 1, 1},
+    {0, 0, 1, 1, 2, 0}, {0, 1, 1, 0, 1, 0}, {0, 2, 1, 1, 2, 0}, {2, 0, 1, 1, 4, 1}, {1.9f, 0, 1, 1, 2, 0},
+    {2, 3, 1, 0, 3, 0}, {2, 4, 1, 1, 4, 1}, {4, 0, 1, 0, FLT_MAX, 0},
+    {-5, 0, 1, 1, 2, 0}, {-5, 1.5f, 1, 0, 1.5f, 0}, {0, FLT_MAX, 1, 1, 2, 0}, {0, 0, 0.5f, 1, 4, 0},
+    {0, 3.9f, 0.5f, 0, 3.9f, 0}, {0, 0, 4, 1, 0.5f, 0}, {0.5f, 0.9f, 4, 0, 0.9f, 0}, {0.5f, 1, 4, 1, 1, 1},
     {3, 2, 1, 0, 2, 0}, {0, 0, -1, 0, FLT_MAX, 0}, {-9, 0, -1, 0, FLT_MAX, 0}, {-0.0f, -0.0f, 1, 1, 2, 0}
   };
   trbvh_geometry g;
@@ -650,7 +697,8 @@ static void test_meaning_of_tmin_and_tmax(void)
     CONTEXT("case %u", i);
     CHECK_MSG(trbvh_intersect(&bvh, &ray, &hit) == cases[i].hit, "prim %u, t %g", hit.prim, (double)hit.t);
     CHECK_MSG(hit.t >= cases[i].t && hit.t <= cases[i].t, "t %g, want %g", (double)hit.t, (double)cases[i].t);
-    CHECK_MSG(hit.prim == (cases[i].hit ? cases[i].prim : TRBVH_NONE) && hit.instance == TRBVH_NONE, "prim %u, want %u", hit.prim, cases[i].prim);
+    CHECK_MSG(hit.prim == (cases[i].hit ? cases[i].prim : TRBVH_NONE) && hit.instance == TRBVH_NONE, "prim %u, want %u",
+        hit.prim, cases[i].prim);
     CHECK(trbvh_occluded(&bvh, &ray) == cases[i].hit);
   }
   { /* u and v belong to the second and third corner */
@@ -691,8 +739,10 @@ static void test_thin_triangles(void)
         ray.origin[(1 + axis) % 3] = (float)k * thick / 4;
         ray.dir[(2 + axis) % 3] = 1;
         CONTEXT("2^-%d thick, axis %d, at %d / 4 of it", e, axis, k);
-        CHECK_MSG(trbvh_intersect(&bvh, &ray, &hit) == inside, "prim %u, u %g, v %g", hit.prim, (double)hit.u, (double)hit.v);
-        if (inside) CHECK_MSG(fabs(hit.v - k / 4.0) < 1e-6 && hit.t >= 2 && hit.t <= 2, "t %.9g, v %g", (double)hit.t, (double)hit.v);
+        CHECK_MSG(trbvh_intersect(&bvh, &ray, &hit) == inside, "prim %u, u %g, v %g", hit.prim, (double)hit.u,
+            (double)hit.v);
+        if (inside)
+          CHECK_MSG(fabs(hit.v - k / 4.0) < 1e-6 && hit.t >= 2 && hit.t <= 2, "t %.9g, v %g", (double)hit.t, (double)hit.v);
       }
       trbvh_free(&bvh);
     }
@@ -732,16 +782,19 @@ static void test_rays_that_hit_nothing(void)
             CHECK(!trbvh_occluded(&bvh[preset], &broken));
           } else {                                                 /* infinite: no crash, and no nonsense */
             int got = trbvh_intersect(&bvh[preset], &broken, &hit);
-            CHECK_MSG(got ? hit.prim < m.s.count && hit.t > 0 : hit.prim == TRBVH_NONE, "prim %u, t %g", hit.prim, (double)hit.t);
+            CHECK_MSG(got ? hit.prim < m.s.count && hit.t > 0 : hit.prim == TRBVH_NONE, "prim %u, t %g", hit.prim,
+                (double)hit.t);
             CHECK(trbvh_occluded(&bvh[preset], &broken) == got);
           }
         }
       broken = ray;
       for (k = 0; k < 3; ++k) broken.dir[k] = i >> k & 1 ? 0.0f : -0.0f;
       CONTEXT("no direction");
-      CHECK(!trbvh_intersect(&bvh[preset], &broken, &hit) && hit.prim == TRBVH_NONE && !trbvh_occluded(&bvh[preset], &broken));
+      CHECK(!trbvh_intersect(&bvh[preset], &broken, &hit) && hit.prim == TRBVH_NONE
+          && !trbvh_occluded(&bvh[preset], &broken));
       memcpy(broken.origin, random_corner(&m, &r), sizeof broken.origin);
-      CHECK(!trbvh_intersect(&bvh[preset], &broken, &hit) && hit.prim == TRBVH_NONE && !trbvh_occluded(&bvh[preset], &broken));
+      CHECK(!trbvh_intersect(&bvh[preset], &broken, &hit) && hit.prim == TRBVH_NONE
+          && !trbvh_occluded(&bvh[preset], &broken));
     }
   for (preset = 0; preset < 3; ++preset) trbvh_free(&bvh[preset]);
   mesh_free(&m);
