@@ -1,4 +1,4 @@
-/* trbvh.h - v0.1.0 - bounding volume hierarchies for ray tracing, as good as offline ones, built in real time
+/* trbvh.h - v0.1.0 - bounding volume hierarchies for ray tracing, nearly as good as offline ones, in real time
  * MIT or public domain, your choice: see the end of this file.
  *
  * Do this in ONE C or C++ file, and include the header alone wherever else you need it:
@@ -31,7 +31,7 @@
  *   The mesh is not needed after the build, except by trbvh_validate.
  *
  * CHOOSING A PRESET (trbvh_options.quality)
- *   FAST    LBVH and collapse: rebuilt every frame, for some ten thousand rays or less a triangle
+ *   FAST    LBVH and collapse: for trees that see fewer than some three rays a triangle, then are rebuilt
  *   MEDIUM  the default: and three rounds of treelet restructuring
  *   HIGH    and triangles split first, 30 % more references: for long, thin or diagonal triangles
  *   BEST    the same as HIGH in this version
@@ -232,7 +232,8 @@ TRBVH_API trbvh_result trbvh_validate(const trbvh *bvh, const trbvh_geometry *ge
 /* Both miss on a tree without triangles (boxes, TRBVH_NO_TRIANGLES): walk nodes[] yourself there. */
 TRBVH_API int trbvh_intersect(const trbvh *bvh, const trbvh_ray *ray, trbvh_hit *hit);      /* closest hit; 1 = hit */
 TRBVH_API int trbvh_occluded (const trbvh *bvh, const trbvh_ray *ray);                      /* any hit; 1 = occluded */
-TRBVH_API trbvh_result trbvh_intersect_n(const trbvh *bvh, const trbvh_ray *rays, trbvh_hit *hits, size_t count, const trbvh_options *options);  /* on options->device or options->jobs */
+/* Many rays at once, on options->device or options->jobs, with progress; options may be NULL. options->stats is written on failure only. */
+TRBVH_API trbvh_result trbvh_intersect_n(const trbvh *bvh, const trbvh_ray *rays, trbvh_hit *hits, size_t count, const trbvh_options *options);
 TRBVH_API trbvh_result trbvh_occluded_n (const trbvh *bvh, const trbvh_ray *rays, uint8_t *occluded, size_t count, const trbvh_options *options);
 
 #endif /* !TRBVH_OPENCL_C */
@@ -2401,22 +2402,22 @@ static void trb_batch_job(void *context, uint32_t index) {
     else batch->occluded[i] = (uint8_t)trbvh_occluded(batch->bvh, &batch->rays[i]);
 }
 
-static trbvh_result trb_run_batch(trb_batch *batch, const trbvh_options *options) {
+static trbvh_result trb_run_batch(trb_batch batch, const trbvh_options *options) {
   trb_build b;
   trbvh_result result;
   memset(&b, 0, sizeof b);
   result = trb_resolve_options(&b, options);
-  if (!result && batch->count && (!batch->bvh || !batch->rays || (!batch->hits && !batch->occluded)))
+  if (!result && batch.count && (!batch.bvh || !batch.rays || (!batch.hits && !batch.occluded)))
     result = trb_fail(&b, TRBVH_INVALID_ARGUMENT, "bvh, rays or results are NULL", 0, 0, 0);
-  if (!result && batch->count && batch->bvh->node_count && !batch->bvh->triangles)
+  if (!result && batch.count && batch.bvh->node_count && !batch.bvh->triangles)
     result = trb_fail(&b, TRBVH_INVALID_ARGUMENT, "the tree has no triangles", 0, 0, 0);
-  if (!result && batch->count / TRB_RAY_BLOCK >= UINT32_MAX)
+  if (!result && batch.count / TRB_RAY_BLOCK >= UINT32_MAX)
     result = trb_fail(&b, TRBVH_TOO_LARGE, "too many rays for one call", 0, 0, 0);
-  if (!result && batch->count) {
-    uint32_t jobs = (uint32_t)((batch->count + TRB_RAY_BLOCK - 1) / TRB_RAY_BLOCK);
+  if (!result && batch.count) {
+    uint32_t jobs = (uint32_t)((batch.count + TRB_RAY_BLOCK - 1) / TRB_RAY_BLOCK);
     trb_runner_start(&b.runner, &b.options, jobs > 1);
     trb_stage(&b.runner, 1);
-    if (trb_run(&b.runner, jobs, trb_batch_job, batch) || trb_stage(&b.runner, 0)) result = TRBVH_CANCELLED;
+    if (trb_run(&b.runner, jobs, trb_batch_job, &batch) || trb_stage(&b.runner, 0)) result = TRBVH_CANCELLED;
     trb_runner_stop(&b.runner);
   }
   if (result && !b.stats.message[0]) trb_fail(&b, result, trbvh_result_text(result), 0, 0, 0);
@@ -2426,24 +2427,14 @@ static trbvh_result trb_run_batch(trb_batch *batch, const trbvh_options *options
 
 TRBVH_API trbvh_result trbvh_intersect_n(const trbvh *bvh, const trbvh_ray *rays, trbvh_hit *hits, size_t count,
                                          const trbvh_options *options) {
-  trb_batch batch;
-  batch.bvh = bvh;
-  batch.rays = rays;
-  batch.hits = hits;
-  batch.occluded = NULL;
-  batch.count = count;
-  return trb_run_batch(&batch, options);
+  const trb_batch batch = {bvh, rays, hits, NULL, count};
+  return trb_run_batch(batch, options);
 }
 
 TRBVH_API trbvh_result trbvh_occluded_n(const trbvh *bvh, const trbvh_ray *rays, uint8_t *occluded, size_t count,
                                         const trbvh_options *options) {
-  trb_batch batch;
-  batch.bvh = bvh;
-  batch.rays = rays;
-  batch.hits = NULL;
-  batch.occluded = occluded;
-  batch.count = count;
-  return trb_run_batch(&batch, options);
+  const trb_batch batch = {bvh, rays, NULL, occluded, count};
+  return trb_run_batch(batch, options);
 }
 
 // >>validate --------------------------------------------------------------------------------------------------------
@@ -2637,3 +2628,51 @@ TRBVH_API trbvh_result trbvh_validate(const trbvh *bvh, const trbvh_geometry *ge
   #pragma GCC pop_options
 #endif
 #endif /* TRBVH_IMPLEMENTATION */
+
+/*
+trbvh is available under either of two licences: choose whichever you prefer.
+
+------------------------------------------------------------------------------
+ALTERNATIVE A - MIT License
+Copyright (c) 2026 The trbvh authors
+
+Permission is hereby granted, free of charge, to any person obtaining a copy of
+this software and associated documentation files (the "Software"), to deal in
+the Software without restriction, including without limitation the rights to
+use, copy, modify, merge, publish, distribute, sublicense, and/or sell copies
+of the Software, and to permit persons to whom the Software is furnished to do
+so, subject to the following conditions:
+
+The above copyright notice and this permission notice shall be included in all
+copies or substantial portions of the Software.
+
+THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR
+IMPLIED, INCLUDING BUT NOT LIMITED TO THE WARRANTIES OF MERCHANTABILITY,
+FITNESS FOR A PARTICULAR PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE
+AUTHORS OR COPYRIGHT HOLDERS BE LIABLE FOR ANY CLAIM, DAMAGES OR OTHER
+LIABILITY, WHETHER IN AN ACTION OF CONTRACT, TORT OR OTHERWISE, ARISING FROM,
+OUT OF OR IN CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE
+SOFTWARE.
+
+------------------------------------------------------------------------------
+ALTERNATIVE B - Public Domain (www.unlicense.org)
+This is free and unencumbered software released into the public domain.
+
+Anyone is free to copy, modify, publish, use, compile, sell, or distribute this
+software, either in source code form or as a compiled binary, for any purpose,
+commercial or non-commercial, and by any means.
+
+In jurisdictions that recognize copyright laws, the author or authors of this
+software dedicate any and all copyright interest in the software to the public
+domain. We make this dedication for the benefit of the public at large and to
+the detriment of our heirs and successors. We intend this dedication to be an
+overt act of relinquishment in perpetuity of all present and future rights to
+this software under copyright law.
+
+THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR
+IMPLIED, INCLUDING BUT NOT LIMITED TO THE WARRANTIES OF MERCHANTABILITY,
+FITNESS FOR A PARTICULAR PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE
+AUTHORS BE LIABLE FOR ANY CLAIM, DAMAGES OR OTHER LIABILITY, WHETHER IN AN
+ACTION OF CONTRACT, TORT OR OTHERWISE, ARISING FROM, OUT OF OR IN CONNECTION
+WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE SOFTWARE.
+*/
