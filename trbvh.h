@@ -232,7 +232,8 @@ TRBVH_API trbvh_result trbvh_validate(const trbvh *bvh, const trbvh_geometry *ge
 /* Both miss on a tree without triangles (boxes, TRBVH_NO_TRIANGLES): walk nodes[] yourself there. */
 TRBVH_API int trbvh_intersect(const trbvh *bvh, const trbvh_ray *ray, trbvh_hit *hit);      /* closest hit; 1 = hit */
 TRBVH_API int trbvh_occluded (const trbvh *bvh, const trbvh_ray *ray);                      /* any hit; 1 = occluded */
-/* Many rays at once, on options->device or options->jobs, with progress; options may be NULL. options->stats is written on failure only. */
+/* Many rays at once, on options->device or options->jobs, with progress; options may be NULL. INVALID_ARGUMENT on a
+ * tree without triangles that is not empty. options->stats is written on failure only. */
 TRBVH_API trbvh_result trbvh_intersect_n(const trbvh *bvh, const trbvh_ray *rays, trbvh_hit *hits, size_t count, const trbvh_options *options);
 TRBVH_API trbvh_result trbvh_occluded_n (const trbvh *bvh, const trbvh_ray *rays, uint8_t *occluded, size_t count, const trbvh_options *options);
 

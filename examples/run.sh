@@ -4,7 +4,8 @@
 # CC chooses the compiler, TRBVH_OUT the folder for the program and the pictures (build/ in the project).
 set -eu
 root=$(cd "$(dirname "$0")/.." && pwd)
-out=${TRBVH_OUT:-$root/build}
+out=${TRBVH_OUT:-build}
+case $out in /*) ;; *) out=$root/$out ;; esac
 
 has() { command -v "$1" >/dev/null 2>&1; }
 find_compiler() {
