@@ -2371,7 +2371,7 @@ static int trb_query(const trbvh *bvh, const trbvh_ray *ray, int any, trbvh_hit 
   static const trbvh_node nothing = {{0, 0, 0}, 0, {0, 0, 0}, 0};
   const trbvh_node *nodes = bvh->node_count ? bvh->nodes : &nothing;
   trb_ray r;
-  if (trb_prepare_ray(&r, ray, nodes->min) && bvh->triangles)
+  if (trb_prepare_ray(&r, ray, (const float *)nodes) && bvh->triangles)
     return any ? trb_trace(nodes, bvh->triangles, &r, 1, hit) : trb_trace(nodes, bvh->triangles, &r, 0, hit);
   trb_miss(&r, hit);
   return 0;
