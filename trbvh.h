@@ -94,7 +94,8 @@ typedef struct trbvh_node {
   float max[3]; trbvh_u32 count;       /* 0 = inner node, else the number of primitives in this leaf */
 } trbvh_node;
 
-/* 48 bytes, stored in leaf order: a leaf is one contiguous run. v0, v1 - v0, v2 - v0. */
+/* 48 bytes, stored in leaf order: a leaf is one contiguous run. v0, v1 - v0, v2 - v0. reserved0: 1 where v0 + e1 or
+ * v0 + e2 does not round to the mesh's v1 or v2, else 0; reserved1: 0. */
 typedef struct trbvh_triangle {
   float v0[3]; trbvh_u32 prim;
   float e1[3]; trbvh_u32 reserved0;
