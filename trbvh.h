@@ -637,27 +637,26 @@ TRB_CORE int trb_cut(float polygon[TRB_POLYGON][3], int n, int k, float position
  * wider by 2^-20 of the coordinates, what is left is padded by 2^-21, and only then cut off at the box's own faces,
  * which it shares with its neighbour: together, the fragments then cover the triangle. */
 TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {
-  float polygon[TRB_POLYGON][3];
+  float polygon[TRB_POLYGON][3], pad[3];
   trbvh_node bounds = *box;
   int i, j, k, n = 3;
   for (i = 0; i < 3; i++)
     for (j = 0; j < 3; j++) polygon[i][j] = v[i][j];
   for (k = 0; k < 3; k++) {
     float a = trb_abs(v[0][k]), b = trb_abs(v[1][k]), c = trb_abs(v[2][k]), ab = TRB_MAX(a, b);
-    float pad = TRB_MAX(ab, c) * 9.5367432e-7f;
-    n = trb_cut(polygon, n, k, box->min[k] - pad, 1);
-    n = trb_cut(polygon, n, k, box->max[k] + pad, -1);
+    pad[k] = TRB_MAX(ab, c) * 9.5367432e-7f;
+    n = trb_cut(polygon, n, k, box->min[k] - pad[k], 1);
+    n = trb_cut(polygon, n, k, box->max[k] + pad[k], -1);
   }
   if (n == 0) return 0;
   for (k = 0; k < 3; k++) {
-    float a = trb_abs(v[0][k]), b = trb_abs(v[1][k]), c = trb_abs(v[2][k]), ab = TRB_MAX(a, b);
-    float pad = TRB_MAX(ab, c) * 4.7683716e-7f, low = polygon[0][k], high = polygon[0][k];
+    float low = polygon[0][k], high = polygon[0][k];
     for (i = 1; i < n; i++) {
       low = TRB_MIN(low, polygon[i][k]);
       high = TRB_MAX(high, polygon[i][k]);
     }
-    low -= pad;
-    high += pad;
+    low -= 0.5f * pad[k];
+    high += 0.5f * pad[k];
     bounds.min[k] = TRB_MAX(low, box->min[k]);
     bounds.max[k] = TRB_MIN(high, box->max[k]);
     if (!(bounds.min[k] <= bounds.max[k])) return 0;
@@ -1169,9 +1168,8 @@ typedef struct trb_task {
 } trb_task;
 
 typedef struct trb_build {
-  const trbvh_geometry *geometry;
   trbvh_geometry        input;           /* with the defaults filled in */
-  trbvh_options         options;         /* likewise: resolved */
+  trbvh_options         options;         /* likewise */
   trbvh_stats           stats;
   trb_runner            runner;
   trb_costs             costs;
@@ -1205,10 +1203,10 @@ static trbvh_result trb_fail(trb_build *b, trbvh_result result, const char *form
 }
 
 /* The geometry with its defaults filled in. */
-static trbvh_result trb_resolve_geometry(trb_build *b) {
+static trbvh_result trb_resolve_geometry(trb_build *b, const trbvh_geometry *geometry) {
   trbvh_geometry *g = &b->input;
-  if (!b->geometry) return trb_fail(b, TRBVH_INVALID_ARGUMENT, "geometry is NULL", 0, 0, 0);
-  *g = *b->geometry;
+  if (!geometry) return trb_fail(b, TRBVH_INVALID_ARGUMENT, "geometry is NULL", 0, 0, 0);
+  *g = *geometry;
   if (g->count == 0) return TRBVH_OK;
   if (g->count > TRB_REFS_MAX)
     return trb_fail(b, TRBVH_TOO_LARGE, "%u primitives, more than %u", g->count, TRB_REFS_MAX, 0);
@@ -1285,8 +1283,7 @@ static trbvh_result trb_resolve_size(trb_build *b) {
 static trbvh_result trb_resolve(trb_build *b, const trbvh_geometry *geometry, const trbvh_options *options) {
   trbvh_result result;
   memset(b, 0, sizeof *b);
-  b->geometry = geometry;
-  result = trb_resolve_geometry(b);
+  result = trb_resolve_geometry(b, geometry);
   if (!result) result = trb_resolve_options(b, options);
   if (!result) result = trb_resolve_size(b);
   return result;
@@ -1949,12 +1946,13 @@ static void trb_restructure_below(trb_build *b, uint32_t *space, uint32_t room, 
 static void trb_treelet_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
   const trb_group *group = &b->groups[index];
+  TRBVH_ASSERT(group->refs < 2 * TRB_BLOCK);
   trb_restructure_below(b, b->lists + 4 * (size_t)group->first_ref, group->refs, group->seeds, b->gamma);
 }
 
 /* One round: groups of subtrees, then the nodes above them. */
 static int trb_round(trb_build *b, uint32_t gamma) {
-  uint32_t *top = (uint32_t *)(void *)b->keys, top_count = 0, i, k, first_ref = 0;
+  uint32_t *top = (uint32_t *)(void *)b->keys, top_count = 0, i, first_ref = 0;
   trb_group *group = NULL;
   const uint32_t above = TRB_MAX(TRB_BLOCK + 1, gamma);
   b->gamma = gamma;
@@ -1977,7 +1975,6 @@ static int trb_round(trb_build *b, uint32_t gamma) {
       first_ref += count;
     }
   }
-  for (k = 0; k < b->group_count; k++) TRBVH_ASSERT(b->groups[k].refs < 2 * TRB_BLOCK);
   if (trb_run(&b->runner, b->group_count, trb_treelet_job, b)) return 1;
   if (trb_count(b->nodes[0].count) >= above) {
     b->lists[0] = 0;
@@ -2579,8 +2576,7 @@ TRBVH_API trbvh_result trbvh_validate(const trbvh *bvh, const trbvh_geometry *ge
   if (why && why_size) why[0] = 0;
   if (!bvh) { trb_damage(&c, "bvh is NULL", 0, 0); return TRBVH_INVALID_ARGUMENT; }
   if (geometry) {
-    b.geometry = geometry;
-    result = trb_resolve_geometry(&b);
+    result = trb_resolve_geometry(&b, geometry);
     if (!result && geometry->count != bvh->prim_count)
       result = trb_fail(&b, TRBVH_INVALID_ARGUMENT, "the tree is over %u primitives, the geometry has %u",
                         bvh->prim_count, geometry->count, 0);
