@@ -242,7 +242,7 @@ TRBVH_API trbvh_result trbvh_occluded_n (const trbvh *bvh, const trbvh_ray *rays
 #endif /* TRBVH_H */
 
 // ===================================================================================================================
-//   IMPLEMENTATION, in the paper's order: references, Morton codes, hierarchy, treelets, collapse; then the queries
+//   IMPLEMENTATION: first the algorithm, in the paper's order, then the stages of a build and the queries, in C
 // ===================================================================================================================
 #if (defined(TRBVH_IMPLEMENTATION) || defined(TRBVH_OPENCL_C)) && !defined(TRBVH_IMPLEMENTED)
 #define TRBVH_IMPLEMENTED
@@ -264,8 +264,15 @@ TRBVH_API trbvh_result trbvh_occluded_n (const trbvh *bvh, const trbvh_ray *rays
 
 #ifdef TRBVH_OPENCL_C
   #define TRB_CORE   static inline __attribute__((unused))
+  #define TRB_SHARED static __attribute__((unused))
   #define TRB_GLOBAL __global
   typedef ulong trb_u64;
+  #ifndef TRB_WORK                       /* where a treelet's working memory lies */
+    #define TRB_WORK
+  #endif
+  #ifdef TRB_CAN_PREFETCH                /* a CPU, compiled by clang */
+    #define TRB_PREFETCH(address) __builtin_prefetch((const void *)(size_t)(address))
+  #endif
   #define trb_bits(x)  as_uint(x)
   #define trb_float(x) as_float(x)
 #else
@@ -280,10 +287,35 @@ TRBVH_API trbvh_result trbvh_occluded_n (const trbvh *bvh, const trbvh_ray *rays
   #else
     #define TRB_CORE static inline
   #endif
+  #define TRB_SHARED static
   #define TRB_GLOBAL
+  #define TRB_WORK
+  #if defined(__GNUC__)
+    #define TRB_PREFETCH(address) __builtin_prefetch(address)
+  #endif
   typedef uint64_t trb_u64;
   TRB_CORE trbvh_u32 trb_bits(float x) { trbvh_u32 u; memcpy(&u, &x, 4); return u; }
   TRB_CORE float trb_float(trbvh_u32 u) { float x; memcpy(&x, &u, 4); return x; }
+#endif
+#ifndef TRB_PREFETCH
+  #define TRB_PREFETCH(address) ((void)(address))
+#endif
+#ifndef TRBVH_ASSERT
+  #define TRBVH_ASSERT(x) ((void)0)
+#endif
+#ifndef TRB_REAL                         /* what triangle tests and sums of areas compute in */
+  #ifdef TRBVH_OPENCL_C
+    #define TRB_REAL float
+    #define TRB_NOISE 9.5367432e-7f      /* 16 units of its rounding */
+  #else
+    #define TRB_REAL double
+    #define TRB_NOISE 1.7763568e-15
+  #endif
+#endif
+#if defined(__GNUC__) || defined(TRBVH_OPENCL_C)
+  #define TRB_ALIGNED(type) type __attribute__((aligned(64)))
+#else
+  #define TRB_ALIGNED(type) type
 #endif
 #if defined(__cplusplus) || defined(_MSC_VER)
   #define TRB_RESTRICT __restrict
@@ -291,10 +323,14 @@ TRBVH_API trbvh_result trbvh_occluded_n (const trbvh *bvh, const trbvh_ray *rays
   #define TRB_RESTRICT restrict
 #endif
 
-// >>core ---- valid C99, C++ and OpenCL C 1.2: what decides a tree, and what a ray meets ----------------------------
+// ===================================================================================================================
+//   THE ALGORITHM, valid C99, C++ and OpenCL C 1.2, in the paper's order: all that decides a tree, and what a ray meets
+// ===================================================================================================================
 /* The OpenCL backend compiles this very text, so that both make the same tree bit for bit. Hence its rules: float,
  * int, uint; no libm, no division and no square root in what decides topology, min and max by comparison, ties
  * broken by structure. Big arrays are TRB_GLOBAL, small ones local; no recursion, no function pointers. */
+
+// >>core ---- arithmetic, boxes and costs, Morton codes, the treelets' dynamic program, splitting --------------------
 
 #define TRB_MIN(a, b) ((a) < (b) ? (a) : (b))     /* the second where one is NaN */
 #define TRB_MAX(a, b) ((a) > (b) ? (a) : (b))
@@ -426,8 +462,9 @@ TRB_CORE trb_u64 trb_morton(trbvh_node box, trb_grid grid) {
  * OpenCL C it may be a vector itself. The table c goes out, for trb_partition to find the topology that made it. */
 #define TRB_TREELET 7
 #ifndef TRB_LANE
-  #define TRB_LANE  float
-  #define TRB_LANES 8                    /* neighbours in memory are TRB_LANES apart */
+  #define TRB_LANE   float
+  #define TRB_LANES  8u                  /* treelets side by side in memory ... */
+  #define TRB_VECTOR 1u                  /* ... of which one variable holds so many */
 #endif
 #define TRB_LEAF_VALUES 8                /* of a treelet leaf: min[3], max[3], references, cost */
 #define TRB_SUBSETS     128              /* one bit a treelet leaf */
@@ -455,7 +492,7 @@ TRB_CORE trb_u64 trb_morton(trbvh_node box, trb_grid grid) {
   t[s][0] = TRB_MIN(t[p][0], t[q][0]); t[s][3] = TRB_MAX(t[p][3], t[q][3]); \
   t[s][1] = TRB_MIN(t[p][1], t[q][1]); t[s][4] = TRB_MAX(t[p][4], t[q][4]); \
   t[s][2] = TRB_MIN(t[p][2], t[q][2]); t[s][5] = TRB_MAX(t[p][5], t[q][5]);
-#define TRB_VALUE(i, k) leaves[((i) * TRB_LEAF_VALUES + (k)) * TRB_LANES]
+#define TRB_VALUE(i, k) leaves[((i) * TRB_LEAF_VALUES + (k)) * (TRB_LANES / TRB_VECTOR)]
 #define TRB_ENTER(t, s, i) \
   t[s][0] = TRB_VALUE(i, 0); t[s][1] = TRB_VALUE(i, 1); t[s][2] = TRB_VALUE(i, 2); \
   t[s][3] = TRB_VALUE(i, 3); t[s][4] = TRB_VALUE(i, 4); t[s][5] = TRB_VALUE(i, 5); \
@@ -472,7 +509,7 @@ TRB_CORE trb_u64 trb_morton(trbvh_node box, trb_grid grid) {
   over = (n[s] - limit) * FLT_MAX; \
   leaf = TRB_MAX(leaf, over); \
   c[s] = TRB_MIN(leaf, split); \
-  table[(s) * TRB_LANES] = c[s]; }
+  table[(s) * (TRB_LANES / TRB_VECTOR)] = c[s]; }
 #define TRB_S2(i, j) TRB_SUBSET((1 << i | 1 << j), TRB_P1(1 << i, 1 << j))
 #define TRB_S3(i, j, k) TRB_SUBSET((1 << i | 1 << j | 1 << k), TRB_P2(1 << i, 1 << j, 1 << k))
 #define TRB_S4(i, j, k, l) \
@@ -484,7 +521,8 @@ TRB_CORE trb_u64 trb_morton(trbvh_node box, trb_grid grid) {
   1 << TRB_SKIP(5, without)))
 #define TRB_SKIP(i, without) ((i) + ((i) >= (without)))
 
-TRB_CORE void trb_treelet_costs(const TRB_LANE *TRB_RESTRICT leaves, TRB_LANE *TRB_RESTRICT table, trb_costs costs) {
+TRB_CORE void trb_treelet_costs(const TRB_WORK TRB_LANE *TRB_RESTRICT leaves, TRB_WORK TRB_LANE *TRB_RESTRICT table,
+                                trb_costs costs) {
   const float ratio = costs.ratio, limit = (float)costs.max_leaf + 0.5f;
   TRB_LANE low[8][6], high[16][6], c[TRB_SUBSETS], n[TRB_SUBSETS], u[TRB_SUBSETS];
   TRB_ENTER(low, 1, 0) TRB_ENTER(low, 2, 1) TRB_ENTER(low, 4, 2)
@@ -518,7 +556,7 @@ TRB_CORE void trb_treelet_costs(const TRB_LANE *TRB_RESTRICT leaves, TRB_LANE *T
 }
 
 /* The part of subset s that holds its lowest leaf in the cheapest partition; among equals the first, counting up. */
-TRB_CORE trbvh_u32 trb_partition(const TRB_LANE *table, trbvh_u32 s) {
+TRB_CORE trbvh_u32 trb_partition(const TRB_WORK float *table, trbvh_u32 s) {
   trbvh_u32 rest = s & (s - 1), q = 0, best_q = 0;
   float best = 0;
   do {                                               /* q: all non-empty subsets of the rest, counting up */
@@ -665,7 +703,855 @@ TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {
   return 1;
 }
 
-// ---- Ray tests ----
+// >>mesh ---- primitives read whatever their form -------------------------------------------------------------------
+/* A geometry, with its defaults filled in. On an OpenCL device, indices are there where index_size is not 0. */
+#ifdef TRBVH_OPENCL_C
+  typedef struct trb_mesh {
+    const __global char *positions, *indices, *boxes;
+    ulong position_stride, box_stride;
+    uint position_count, index_size, count;
+  } trb_mesh;
+#else
+  typedef trbvh_geometry trb_mesh;
+#endif
+#define TRB_AHEAD 32u                    /* how far ahead random reads are asked for */
+
+/* Host memory may have any alignment. */
+TRB_CORE void trb_load_position(float out[3], const TRB_GLOBAL char *p) {
+#ifdef TRBVH_OPENCL_C
+  const __global float *position = (const __global float *)p;
+  out[0] = position[0];
+  out[1] = position[1];
+  out[2] = position[2];
+#else
+  memcpy(out, p, 12);
+#endif
+}
+
+TRB_CORE trbvh_u32 trb_index(const trb_mesh *mesh, size_t i) {
+#ifdef TRBVH_OPENCL_C
+  return mesh->index_size == 2 ? ((const __global ushort *)mesh->indices)[i] : ((const __global uint *)mesh->indices)[i];
+#else
+  uint32_t index;
+  uint16_t index16;
+  if (mesh->index_size == 2) {
+    memcpy(&index16, (const char *)mesh->indices + i * 2, 2);
+    return index16;
+  }
+  memcpy(&index, (const char *)mesh->indices + i * 4, 4);
+  return index;
+#endif
+}
+
+TRB_CORE const TRB_GLOBAL char *trb_position(const trb_mesh *mesh, size_t i) {
+  return (const TRB_GLOBAL char *)mesh->positions + i * mesh->position_stride;
+}
+
+/* The corners of triangle i; 0 where one of its indices is out of range, which vertex then tells. */
+TRB_SHARED int trb_load_triangle(const trb_mesh *mesh, trbvh_u32 i, float v[3][3], trbvh_u32 *vertex) {
+  size_t k, corner = (size_t)i * 3;
+  for (k = 0; k < 3; k++) {
+    size_t position = corner + k;
+    if (mesh->indices) {
+      *vertex = trb_index(mesh, corner + k);
+      if (*vertex >= mesh->position_count) return 0;
+      position = *vertex;
+    }
+    trb_load_position(v[k], trb_position(mesh, position));
+  }
+  return 1;
+}
+
+/* Asks for a triangle's indices, well before, and for its positions, once they are there. TRB_CORE, always inlined:
+ * gcc takes a function that only prefetches for one without effect, and drops its calls. */
+TRB_CORE void trb_prefetch_indices(const trb_mesh *mesh, trbvh_u32 i) {
+  if (mesh->indices) TRB_PREFETCH((const TRB_GLOBAL char *)mesh->indices + (size_t)i * 3 * mesh->index_size);
+}
+
+TRB_CORE void trb_prefetch_positions(const trb_mesh *mesh, trbvh_u32 i) {
+  size_t k, corner = (size_t)i * 3;
+  for (k = 0; k < 3; k++)
+    TRB_PREFETCH(trb_position(mesh, mesh->indices ? trb_index(mesh, corner + k) : corner + k));
+}
+
+TRB_SHARED trbvh_node trb_no_box(void) {
+  trbvh_node n;
+  int k;
+  for (k = 0; k < 3; k++) { n.min[k] = FLT_MAX; n.max[k] = -FLT_MAX; }
+  n.first = n.count = 0;
+  return n;
+}
+
+TRB_SHARED void trb_include(trbvh_node *n, const float low[3], const float high[3]) {
+  int k;
+  for (k = 0; k < 3; k++) {
+    n->min[k] = TRB_MIN(low[k], n->min[k]);
+    n->max[k] = TRB_MAX(high[k], n->max[k]);
+  }
+}
+
+/* 0 for a triangle with a NaN or infinity. */
+TRB_SHARED int trb_triangle_box(const float v[3][3], trbvh_node *box) {
+  int k, finite = 1;
+  for (k = 0; k < 3; k++) {
+    float low = TRB_MIN(v[0][k], v[1][k]), high = TRB_MAX(v[0][k], v[1][k]);
+    box->min[k] = TRB_MIN(v[2][k], low);
+    box->max[k] = TRB_MAX(v[2][k], high);
+    finite &= trb_finite(v[0][k]) & trb_finite(v[1][k]) & trb_finite(v[2][k]);
+  }
+  box->first = box->count = 0;
+  return finite;
+}
+
+TRB_SHARED int trb_valid_box(trbvh_node box) {
+  int k, valid = 1;
+  for (k = 0; k < 3; k++) valid &= trb_finite(box.min[k]) & trb_finite(box.max[k]) & (box.min[k] <= box.max[k]);
+  return valid;
+}
+
+/* The box of primitive i: 1, or 0 where it is to be skipped, -1 where it has an index out of range. A triangle's
+ * corners go to v. */
+TRB_SHARED int trb_prim_box(const trb_mesh *mesh, trbvh_u32 i, trbvh_node *box, float v[3][3], trbvh_u32 *vertex) {
+  const TRB_GLOBAL char *p;
+  if (!mesh->boxes) return trb_load_triangle(mesh, i, v, vertex) ? trb_triangle_box((const float (*)[3])v, box) : -1;
+  p = (const TRB_GLOBAL char *)mesh->boxes + (size_t)i * mesh->box_stride;
+  trb_load_position(box->min, p);
+  trb_load_position(box->max, p + 12);
+  box->first = box->count = 0;
+  return trb_valid_box(*box);
+}
+
+/* The grid over a scene with these bounds. */
+TRB_SHARED trb_grid trb_make_grid(trbvh_node bounds) {
+  trb_grid grid;
+  float extent = 0;
+  int k;
+  for (k = 0; k < 3; k++) {
+    float side = bounds.max[k] - bounds.min[k];
+    grid.origin[k] = bounds.min[k];
+    extent = TRB_MAX(side, extent);
+  }
+  grid.units_per_cell = extent * (1.0f / 2097152.0f);
+  grid.cells_per_unit = extent > 1e-30f && extent < FLT_MAX ? trb_reciprocal(grid.units_per_cell) : 0;
+  return grid;
+}
+
+// >>splits ---- the paper's section 4: fewer, better used references than a spatial split builder's -----------------
+/* Every triangle t gets s(t) = floor(D p(t)) splits, p its priority, with the largest scale D that keeps their sum
+ * within the budget, found by bisection. Priorities are rounded to 24-bit integers first, so that all sums are exact
+ * and their order does not matter. A triangle is cut at the most important median plane in its box; what is left of
+ * its splits after this one goes to the halves by their longest sides; and so on down to no splits. */
+#define TRB_SCALE_BITS  36
+#define TRB_SCALES      2561u            /* scales to choose from, ascending, of seven significant bits each */
+#define TRB_SPLIT_STACK 64u              /* fragments of one triangle that wait to be split */
+
+TRB_CORE trb_u64 trb_scale(trbvh_u32 i) { return (trb_u64)(64 + (i & 63)) << (i >> 6) >> 6; }
+
+/* The power of two that takes the largest priority to 24 bits. */
+TRB_CORE float trb_priority_unit(float largest) {
+  trbvh_u32 exponent = trb_bits(largest) >> 23;
+  return trb_float((127u + 127u + 23u - TRB_MAX(exponent, 24u)) << 23);
+}
+
+TRB_CORE trb_u64 trb_splits(float priority, float unit, trb_u64 scale) {
+  return ((trb_u64)(trbvh_u32)(priority * unit) * scale) >> TRB_SCALE_BITS;
+}
+
+/* Cuts one reference into up to splits + 1, left before right; returns how many. */
+TRB_SHARED trbvh_u32 trb_split_reference(const trb_mesh *mesh, trb_grid grid, trbvh_node ref, trbvh_u32 splits,
+                                         TRB_GLOBAL trbvh_node *out) {
+  struct { trbvh_node box; trbvh_u32 splits; } stack[TRB_SPLIT_STACK];
+  trbvh_u32 top = 0, count = 0, vertex;
+  float v[3][3];
+  if (splits) trb_load_triangle(mesh, ref.first, v, &vertex);
+  stack[top].box = ref;
+  stack[top++].splits = splits;
+  while (top) {
+    trbvh_node left, right;
+    trb_plane plane;
+    int in_left, in_right;
+    trbvh_u32 rest = stack[--top].splits;
+    left = right = stack[top].box;
+    if (rest == 0 || top + 2 > TRB_SPLIT_STACK || !trb_choose_plane(left, grid, &plane)) {
+      out[count++] = left;
+      continue;
+    }
+    left.max[plane.axis] = right.min[plane.axis] = plane.position;
+    in_left = trb_clip((const float (*)[3])v, &left);
+    in_right = trb_clip((const float (*)[3])v, &right);
+    if (in_left && in_right) {
+      trbvh_u32 share = trb_share(--rest, trb_longest_side(left), trb_longest_side(right));
+      stack[top].box = right;
+      stack[top++].splits = rest - share;
+      stack[top].box = left;
+      stack[top++].splits = share;
+    } else if (in_left || in_right) {                /* the triangle only touches the plane: try again within */
+      stack[top].box = in_left ? left : right;
+      stack[top++].splits = rest - 1;
+    } else {
+      out[count++] = stack[top].box;
+    }
+  }
+  return count;
+}
+
+// >>sort ---- references along the Morton curve: a stable radix sort of 64-bit keys ---------------------------------
+/* Where up to TRB_PACKED_REFS references are possible, a key holds the leading bits of the Morton code above the
+ * reference's index, so that keys differ and carry what they sort: 44 bits of code up to 2^19 references, 39 at 2^24.
+ * Only the code's digits are sorted; indices are in order already. Above that, all 63 bits count: references are
+ * sorted by the low 31 bits of their codes, then by the high 32, with the same keys of half code, half index. */
+#ifndef TRB_PACKED_REFS                  /* lower in a test */
+  #define TRB_PACKED_REFS (1u << 24)
+#endif
+#define TRB_CODE_BITS  44u               /* of the Morton code in a packed key, at most: four digits of the sort */
+#define TRB_DIGIT_BITS 11u
+#define TRB_DIGITS     (1u << TRB_DIGIT_BITS)
+#define TRB_SORT_BLOCK 65536u            /* keys a job counts and scatters */
+
+/* What keys look like: bits of code, above shift bits of index. */
+typedef struct trb_key_form { trbvh_u32 packed, bits, shift; } trb_key_form;
+
+TRB_CORE trbvh_u32 trb_key_ref(trb_u64 key, trb_key_form form) {     /* form.shift may be 32 */
+  return (trbvh_u32)(key & (((trb_u64)1 << form.shift) - 1));
+}
+
+/* The key of reference ref; of unpacked keys, that with the high half of its code, or the low one. */
+TRB_CORE trb_u64 trb_key(trbvh_node box, trbvh_u32 ref, trb_grid grid, trb_key_form form, int high) {
+  trb_u64 code = trb_morton(box, grid);
+  if (form.packed) code >>= 63 - form.bits;
+  else code = high ? code >> 31 : code & 0x7FFFFFFFu;
+  return code << form.shift | ref;
+}
+
+TRB_SHARED void trb_count_digits(const TRB_GLOBAL trb_u64 *keys, trbvh_u32 count, trbvh_u32 shift,
+                                 TRB_GLOBAL trbvh_u32 *histogram) {
+  trbvh_u32 i;
+  for (i = 0; i < TRB_DIGITS; i++) histogram[i] = 0;
+  for (i = 0; i < count; i++) histogram[(keys[i] >> shift) & (TRB_DIGITS - 1)]++;
+}
+
+/* next: where the next key of each digit goes. */
+TRB_SHARED void trb_scatter_keys(const TRB_GLOBAL trb_u64 *keys, trbvh_u32 count, trbvh_u32 shift,
+                                 TRB_GLOBAL trbvh_u32 *next, TRB_GLOBAL trb_u64 *sorted) {
+  trbvh_u32 i;
+  for (i = 0; i < count; i++) {
+    trb_u64 key = keys[i];
+    sorted[next[(key >> shift) & (TRB_DIGITS - 1)]++] = key;
+  }
+}
+
+/* Turns the blocks' histograms into the places of their first keys. */
+TRB_SHARED void trb_place_digits(TRB_GLOBAL trbvh_u32 *histograms, trbvh_u32 blocks) {
+  trbvh_u32 digit, block, start = 0;
+  for (digit = 0; digit < TRB_DIGITS; digit++)
+    for (block = 0; block < blocks; block++) {
+      TRB_GLOBAL trbvh_u32 *count = histograms + (size_t)block * TRB_DIGITS + digit;
+      trbvh_u32 n = *count;
+      *count = start;
+      start += n;
+    }
+}
+
+// >>hierarchy ---- the linear BVH (Karras 2012, "Maximizing Parallelism in the Construction of BVHs, Octrees...") ----
+/* The binary radix tree over the sorted keys: every node splits its range where the highest bit changes. On a CPU one
+ * pass over the leaves is fastest: neighbours differ by exclusive or, a smaller value splits deeper; subtrees wait on
+ * a stack for a shallower split to their right, which makes them the left child of what follows them (the Cartesian
+ * tree). Blocks of leaves are built alone; subtrees whose parents reach beyond their block stay open, and the same
+ * pass over them makes the top of the tree. Children stand before their parents, in cache lines of their own. */
+#define TRB_BLOCK    16384u              /* primitives, references or leaves a job works on: their nodes fit a cache */
+#define TRB_OPEN_MAX 200u                /* subtrees of a block that its neighbours complete: 2 (63 + 32) + 1 at most */
+#define TRB_NO_SPLIT (~(trb_u64)0)       /* shallower than any: the end of the scene */
+
+/* Sorted references. */
+typedef struct trb_curve {
+  const TRB_GLOBAL trb_u64    *keys;
+  const TRB_GLOBAL trbvh_node *refs;
+  trb_grid     grid;
+  trb_key_form form;
+  trbvh_u32    count;
+} trb_curve;
+
+/* What splits sorted leaf i from leaf i + 1: larger is shallower. */
+TRB_CORE trb_u64 trb_split_after(const trb_curve *c, trbvh_u32 i) {
+  trb_u64 a, b, code;
+  if (i >= c->count - 1) return TRB_NO_SPLIT;         /* also for 0 - 1 */
+  a = c->keys[i];
+  b = c->keys[i + 1];
+  if (c->form.packed) return a ^ b;
+  code = trb_morton(c->refs[trb_key_ref(a, c->form)], c->grid) ^ trb_morton(c->refs[trb_key_ref(b, c->form)], c->grid);
+  return code ? code | (trb_u64)1 << 63 : (trbvh_u32)(a ^ b);
+}
+
+/* A subtree whose parent reaches beyond its block: what splits it from its right neighbour, and the place its parent
+ * may put the two at. */
+typedef struct trb_open { trbvh_node node; trb_u64 split; trbvh_u32 pair; } trb_open;
+typedef struct trb_range { trbvh_u32 open_count; trb_open open[TRB_OPEN_MAX]; } trb_range;
+
+typedef struct trb_forest {
+  TRB_GLOBAL trbvh_node *nodes;
+  TRB_GLOBAL trb_range  *range;          /* where subtrees that stay open go */
+  trb_costs  costs;
+  trb_u64    left_split;                 /* between the bottom of the stack and what is left of it */
+  trbvh_u32  next_pair, height;
+  trb_open   stack[TRB_OPEN_MAX];
+} trb_forest;
+
+TRB_CORE trbvh_node trb_join(trb_forest *f, trbvh_node left, trbvh_node right, trbvh_u32 pair) {
+  f->nodes[2 * pair] = left;
+  f->nodes[2 * pair + 1] = right;
+  return trb_parent(left, right, 2 * pair, f->costs);
+}
+
+TRB_SHARED void trb_leave_open(trb_forest *f, const trb_open *subtree) {
+  TRBVH_ASSERT(f->range->open_count < TRB_OPEN_MAX);
+  f->range->open[f->range->open_count++] = *subtree;
+}
+
+/* The next subtree from the left; split is between it and its right neighbour; pair is for their parent, or 0. */
+TRB_SHARED void trb_push(trb_forest *f, trbvh_node node, trb_u64 split, trbvh_u32 pair) {
+  trb_open *top;
+  while (f->height && f->stack[f->height - 1].split <= split) {
+    top = &f->stack[--f->height];
+    if (f->height || f->left_split >= top->split) {
+      node = trb_join(f, top->node, node, top->pair ? top->pair : f->next_pair++);
+    } else {                             /* their parent begins left of the block */
+      f->left_split = top->split;
+      trb_leave_open(f, top);
+    }
+  }
+  TRBVH_ASSERT(f->height < TRB_OPEN_MAX);
+  top = &f->stack[f->height++];
+  top->node = node;
+  top->split = split;
+  top->pair = pair;
+}
+
+/* The subtrees over sorted leaves first..end - 1. Pairs of siblings are numbered from 1, and stand at twice that. */
+TRB_SHARED void trb_build_block(const trb_curve *curve, trbvh_u32 first, trbvh_u32 end, trb_costs costs,
+                                TRB_GLOBAL trbvh_node *nodes, TRB_GLOBAL trb_range *range) {
+  trbvh_u32 i;
+  trb_forest f;
+  f.nodes = nodes;
+  f.range = range;
+  f.costs = costs;
+  f.left_split = trb_split_after(curve, first - 1);
+  f.next_pair = first + 1;
+  f.height = 0;
+  range->open_count = 0;
+  for (i = first; i < end; i++) {
+    trbvh_node ref = curve->refs[trb_key_ref(curve->keys[i], curve->form)];
+    if (i + TRB_AHEAD < end) TRB_PREFETCH(&curve->refs[trb_key_ref(curve->keys[i + TRB_AHEAD], curve->form)]);
+    trb_push(&f, trb_reference(ref, costs), trb_split_after(curve, i), 0);
+  }
+  for (i = 0; i < f.height; i++) trb_leave_open(&f, &f.stack[i]);
+  for (i = 0; i < range->open_count; i++) range->open[i].pair = f.next_pair + i;
+}
+
+/* The tree above the blocks; its root is nodes[0]. */
+TRB_SHARED void trb_build_top(TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trb_range *ranges, trbvh_u32 blocks,
+                              trb_costs costs) {
+  trbvh_u32 i, k;
+  trb_forest f;
+  f.nodes = nodes;
+  f.range = 0;
+  f.costs = costs;
+  f.left_split = TRB_NO_SPLIT;
+  f.next_pair = f.height = 0;
+  for (i = 0; i < blocks; i++)
+    for (k = 0; k < ranges[i].open_count; k++)
+      trb_push(&f, ranges[i].open[k].node, ranges[i].open[k].split, ranges[i].open[k].pair);
+  TRBVH_ASSERT(f.height == 1);
+  nodes[0] = f.stack[0].node;
+}
+
+// >>treelets ---- restructuring by dynamic programming (paper, section 3) -------------------------------------------
+/* In round r every node of 7 * 2^r references or more becomes the root of a treelet once, after both its children's
+ * subtrees have been through round r. Its two children are the first treelet leaves; five times, the one of largest
+ * area is replaced by its own children. If the best topology over the seven leaves beats the present one, the root,
+ * which keeps its place, gets it; the six pairs of siblings are used again. Nothing else is said about the order, and
+ * nothing depends on it: numbers of nodes never break a tie.
+ *
+ * On a CPU, subtrees of up to TRB_BLOCK references are jobs. A job sorts its treelet roots by height, roots of one
+ * height being independent, and takes TRB_LANES of them at a time through the dynamic program; then the few roots
+ * above all jobs go the same way. */
+typedef struct trb_treelets {
+  float     leaves[TRB_TREELET * TRB_LEAF_VALUES * TRB_LANES];
+  float     table[TRB_SUBSETS * TRB_LANES + 16]; /* padded: leaves and table otherwise fall on the same cache sets */
+  float     area[TRB_TREELET - 1][TRB_LANES];    /* of the nodes expanded, the root first */
+  trbvh_u32 slot[TRB_TREELET][TRB_LANES];        /* the treelet leaves' nodes ... */
+  trbvh_u32 key[TRB_TREELET][TRB_LANES];         /* ... and their rank for expansion */
+  trbvh_u32 pair[TRB_TREELET - 1][TRB_LANES];    /* where the children of the expanded nodes stand */
+  trbvh_u32 parent[TRB_TREELET - 1][TRB_LANES];  /* which slot was expanded: left child there, right child in a new one */
+} trb_treelets;
+
+TRB_CORE void trb_expand(const TRB_GLOBAL trbvh_node *nodes, TRB_WORK trb_treelets *t, trbvh_u32 lane, trbvh_u32 step,
+                         trbvh_u32 slot, trbvh_u32 node) {
+  trbvh_u32 pair = nodes[node].first;
+  t->area[step][lane] = trb_area(nodes[node]);
+  t->pair[step][lane] = pair;
+  t->parent[step][lane] = slot;
+  t->slot[slot][lane] = pair;
+  t->slot[step + 1][lane] = pair + 1;
+  t->key[slot][lane] = trb_expand_key(nodes[pair], slot);
+  t->key[step + 1][lane] = trb_expand_key(nodes[pair + 1], step + 1);
+}
+
+TRB_CORE void trb_expand_largest(const TRB_GLOBAL trbvh_node *nodes, TRB_WORK trb_treelets *t, trbvh_u32 lane,
+                                 trbvh_u32 step) {
+  trbvh_u32 best = t->key[0][lane], i;
+  for (i = 1; i <= step; i++) best = TRB_MAX(t->key[i][lane], best);
+  i = TRB_TREELET - (best & 7u);
+  trb_expand(nodes, t, lane, step, i, t->slot[i][lane]);
+}
+
+/* Hands treelet leaf i to the dynamic program. */
+TRB_CORE void trb_enter_leaf(const TRB_GLOBAL trbvh_node *nodes, TRB_WORK trb_treelets *t, trbvh_u32 lane, trbvh_u32 i) {
+  const TRB_GLOBAL trbvh_node *leaf = &nodes[t->slot[i][lane]];
+  TRB_WORK float *value = &t->leaves[i * TRB_LEAF_VALUES * TRB_LANES + lane];
+  value[0 * TRB_LANES] = leaf->min[0];
+  value[1 * TRB_LANES] = leaf->min[1];
+  value[2 * TRB_LANES] = leaf->min[2];
+  value[3 * TRB_LANES] = leaf->max[0];
+  value[4 * TRB_LANES] = leaf->max[1];
+  value[5 * TRB_LANES] = leaf->max[2];
+  value[6 * TRB_LANES] = (float)trb_count(leaf->count);
+  value[7 * TRB_LANES] = trb_cost(leaf->count);
+}
+
+/* The cost of a treelet as it is, on the scale of trb_treelet_costs; uses up what it is told about the leaves. */
+TRB_SHARED float trb_present_cost(TRB_WORK trb_treelets *t, trbvh_u32 lane, trb_costs costs) {
+  float cost[TRB_TREELET] = {0, 0, 0, 0, 0, 0, 0};
+  trbvh_u32 step = TRB_TREELET - 1;
+  while (step--) {                                   /* last expanded first: children before parents */
+    trbvh_u32 left = t->parent[step][lane], right = step + 1;
+    TRB_WORK float *l = &t->leaves[left * TRB_LEAF_VALUES * TRB_LANES + lane];
+    const TRB_WORK float *r = &t->leaves[right * TRB_LEAF_VALUES * TRB_LANES + lane];
+    float area = t->area[step][lane];
+    l[6 * TRB_LANES] += r[6 * TRB_LANES];
+    l[7 * TRB_LANES] += r[7 * TRB_LANES];
+    cost[left] = area + (cost[left] + cost[right]);
+    if (l[6 * TRB_LANES] <= (float)costs.max_leaf) {
+      float leaf = costs.ratio * area * l[6 * TRB_LANES] - l[7 * TRB_LANES];
+      cost[left] = TRB_MIN(leaf, cost[left]);
+    }
+  }
+  return cost[0];
+}
+
+/* The six pairs a treelet may use, last one first. */
+TRB_SHARED void trb_sort_pairs(const TRB_WORK trb_treelets *t, trbvh_u32 lane, trbvh_u32 pairs[TRB_TREELET - 1]) {
+  trbvh_u32 i, k;
+  for (i = 0; i < TRB_TREELET - 1; i++) {
+    trbvh_u32 pair = t->pair[i][lane];
+    for (k = i; k > 0 && pairs[k - 1] < pair; k--) pairs[k] = pairs[k - 1];
+    pairs[k] = pair;
+  }
+}
+
+/* Gives the root of a treelet the best topology. Nodes are laid out as the hierarchy does it, children before parents
+ * and left before right, which is the order that the collapse walks through backwards. */
+TRB_SHARED void trb_rebuild_treelet(TRB_GLOBAL trbvh_node *nodes, const TRB_WORK trb_treelets *t, trbvh_u32 lane,
+                                    trbvh_u32 root, trb_costs costs) {
+  trbvh_node leaf[TRB_TREELET];
+  trbvh_u32 pairs[TRB_TREELET - 1], node[TRB_TREELET - 1], i, side, waiting = 0;
+  trbvh_u32 stack_node[TRB_TREELET], stack_subset[TRB_TREELET];
+  for (i = 0; i < TRB_TREELET; i++) leaf[i] = nodes[t->slot[i][lane]];
+  trb_sort_pairs(t, lane, pairs);
+  stack_node[waiting] = root;
+  stack_subset[waiting++] = TRB_SUBSETS - 1;
+  for (i = 0; waiting; i++) {                        /* inner nodes from the root down, their children at pairs[i] */
+    trbvh_u32 subset = stack_subset[--waiting], part = trb_partition(t->table + lane, subset);
+    node[i] = stack_node[waiting];
+    for (side = 0; side < 2; side++, part ^= subset) {
+      if (TRB_SINGLE(part)) {
+        nodes[pairs[i] + side] = leaf[trb_log2(part)];
+      } else {
+        stack_node[waiting] = pairs[i] + side;
+        stack_subset[waiting++] = part;
+      }
+    }
+  }
+  while (i--) nodes[node[i]] = trb_parent(nodes[pairs[i]], nodes[pairs[i] + 1], pairs[i], costs);
+}
+
+/* After the dynamic program: the better topology, if there is one. */
+TRB_CORE void trb_finish_treelet(TRB_GLOBAL trbvh_node *nodes, TRB_WORK trb_treelets *t, trbvh_u32 lane, trbvh_u32 root,
+                                 trb_costs costs) {
+  float best = t->table[(TRB_SUBSETS - 1) * TRB_LANES + lane];
+  TRB_GLOBAL trbvh_node *node = &nodes[root];
+  if (trb_improves(best, trb_present_cost(t, lane, costs))) trb_rebuild_treelet(nodes, t, lane, root, costs);
+  else if (trb_count(node->count) <= costs.max_leaf)           /* cheaper all the same, if a subtree below is */
+    *node = trb_parent(nodes[node->first], nodes[node->first + 1], node->first, costs);
+}
+
+/* Up to TRB_LANES roots, none above another. Steps outside, lanes inside, so that one lane's cache misses hide behind
+ * the others' work. */
+TRB_SHARED void trb_restructure(TRB_GLOBAL trbvh_node *nodes, TRB_WORK trb_treelets *t, const TRB_GLOBAL trbvh_u32 *roots,
+                                trbvh_u32 lanes, trb_costs costs) {
+  trbvh_u32 lane, i;
+  for (lane = 0; lane < lanes; lane++) trb_expand(nodes, t, lane, 0, 0, roots[lane]);
+  for (i = 1; i < TRB_TREELET - 1; i++)
+    for (lane = 0; lane < lanes; lane++) trb_expand_largest(nodes, t, lane, i);
+  for (i = 0; i < TRB_TREELET; i++)
+    for (lane = 0; lane < lanes; lane++) trb_enter_leaf(nodes, t, lane, i);
+  for (lane = 0; lane < TRB_LANES; lane += TRB_VECTOR)
+    trb_treelet_costs((const TRB_WORK TRB_LANE *)(t->leaves + lane), (TRB_WORK TRB_LANE *)(t->table + lane), costs);
+  for (lane = 0; lane < lanes; lane++) trb_finish_treelet(nodes, t, lane, roots[lane], costs);
+}
+
+#if !defined(TRBVH_OPENCL_C) || defined(TRB_CPU)
+/* All nodes of at least `smallest` references below the seeds, lowest first. space: four times `room` words, where
+ * room bounds their number, with the seeds at its start. */
+TRB_SHARED void trb_restructure_below(TRB_GLOBAL trbvh_node *nodes, TRB_GLOBAL trbvh_u32 *space, trbvh_u32 room,
+                                      trbvh_u32 seeds, trbvh_u32 smallest, trb_costs costs) {
+  TRB_GLOBAL trbvh_u32 *node = space, *parent = space + room, *height = parent + room, *sorted = height + room;
+  TRB_GLOBAL trbvh_u32 *start = parent;
+  trbvh_u32 count = seeds, highest = 0, i, k;
+  TRB_ALIGNED(trb_treelets) t;                       /* vectors across cache lines: 20 % slower */
+  for (i = 0; i < TRB_TREELET * TRB_LEAF_VALUES * TRB_LANES; i++) t.leaves[i] = 0;
+  for (i = 0; i < seeds; i++) parent[i] = TRBVH_NONE;
+  for (i = 0; i < count; i++) {                      /* breadth first, parents before children */
+    height[i] = 0;
+    for (k = 0; k < 2; k++) {
+      trbvh_u32 child = nodes[node[i]].first + k;
+      if (trb_count(nodes[child].count) < smallest) continue;
+      parent[count] = i;
+      node[count++] = child;
+    }
+  }
+  TRBVH_ASSERT(count <= room);
+  for (i = count; i-- > 0;) {
+    highest = TRB_MAX(height[i], highest);
+    if (parent[i] != TRBVH_NONE) height[parent[i]] = TRB_MAX(height[i] + 1, height[parent[i]]);
+  }
+  for (i = 0; i <= highest + 1; i++) start[i] = 0;   /* counting sort; parents are no longer needed */
+  for (i = 0; i < count; i++) start[height[i] + 1]++;
+  for (i = 0; i < highest; i++) start[i + 1] += start[i];
+  for (i = 0; i < count; i++) sorted[start[height[i]]++] = node[i];
+  for (i = 0, k = 0; k <= highest; k++)              /* start[k] has moved to the end of height k */
+    for (; i < start[k]; i += TRB_MIN(TRB_LANES, start[k] - i))
+      trb_restructure(nodes, &t, sorted + i, TRB_MIN(TRB_LANES, start[k] - i), costs);
+}
+
+/* Subtrees that one job restructures, and the references in them. */
+typedef struct trb_group { trbvh_u32 first_ref, refs, seeds; } trb_group;
+
+/* Deals the subtrees of gamma to TRB_BLOCK references out into groups; returns how many. top: room for the nodes above
+ * them. lists: eight words a reference; a group's seeds go to its first reference's. */
+TRB_SHARED trbvh_u32 trb_find_groups(const TRB_GLOBAL trbvh_node *nodes, TRB_GLOBAL trbvh_u32 *top,
+                                     TRB_GLOBAL trbvh_u32 *lists, TRB_GLOBAL trb_group *groups, trbvh_u32 gamma) {
+  const trbvh_u32 above = TRB_MAX(TRB_BLOCK + 1, gamma);
+  trbvh_u32 top_count = 1, group_count = 0, first_ref = 0, i;
+  trb_group group = {0, 0, 0};
+  top[0] = 0;
+  for (i = 0; i < top_count; i++) {
+    const trbvh_node node = nodes[top[i]];
+    trbvh_u32 count = trb_count(node.count);
+    if (count >= above) {
+      top[top_count++] = node.first;
+      top[top_count++] = node.first + 1;
+    } else if (count >= gamma) {
+      if (group_count == 0 || group.refs >= TRB_BLOCK) {
+        group_count++;
+        group.first_ref = first_ref;
+        group.refs = group.seeds = 0;
+      }
+      lists[4 * (size_t)group.first_ref + group.seeds++] = top[i];
+      group.refs += count;
+      first_ref += count;
+      groups[group_count - 1] = group;
+    }
+  }
+  return group_count;
+}
+
+TRB_SHARED void trb_restructure_group(TRB_GLOBAL trbvh_node *nodes, TRB_GLOBAL trbvh_u32 *lists, trb_group group,
+                                      trbvh_u32 gamma, trb_costs costs) {
+  TRBVH_ASSERT(group.refs < 2 * TRB_BLOCK);
+  trb_restructure_below(nodes, lists + 4 * (size_t)group.first_ref, group.refs, group.seeds, gamma, costs);
+}
+
+/* The nodes above all groups. */
+TRB_SHARED void trb_restructure_top(TRB_GLOBAL trbvh_node *nodes, TRB_GLOBAL trbvh_u32 *lists, trbvh_u32 refs,
+                                    trbvh_u32 gamma, trb_costs costs) {
+  const trbvh_u32 above = TRB_MAX(TRB_BLOCK + 1, gamma);
+  if (trb_count(nodes[0].count) < above) return;
+  lists[0] = 0;
+  trb_restructure_below(nodes, lists, refs, 1, above, costs);
+}
+#endif
+
+// >>collapse ---- subtrees that are cheaper as leaves become leaves, and the tree moves into its final layout --------
+/* Every small node knows already whether it is better as a leaf (equation 2, trb_parent); the topmost such nodes
+ * become leaves. Two walks from the root down, in the same order: the first counts leaves and
+ * primitives, the second writes; in between, the result is allocated and prefix sums tell every job its place. Right
+ * before left, because the hierarchy laid children before parents: both walks then run through memory backwards, one
+ * line after the other.
+ *
+ * The depth bound: a node at depth d with n references can always be made a balanced subtree that ends at depth
+ * d + ceil(log2 n). Where a child could no longer be made so within TRBVH_MAX_DEPTH, its parent still can, and is. As
+ * this holds at the root, it holds everywhere. */
+typedef struct trb_collapser {
+  TRB_GLOBAL trbvh_node *nodes;
+  TRB_GLOBAL trbvh_node *spare;          /* scratch memory, for subtrees that are too deep: one node a reference ... */
+  TRB_GLOBAL trbvh_u32  *words[2];       /* ... and twice two words */
+  trb_costs costs;
+  float     cost_node, cost_prim;
+  trbvh_u32 split;                       /* not 0: one primitive may have several references */
+  TRB_GLOBAL trbvh_node *out;            /* the result, for the second walk */
+  TRB_GLOBAL trbvh_u32  *prims;
+} trb_collapser;
+
+/* Makes the subtree of a node, the first of whose references is the first_ref-th of the tree, a balanced one. */
+TRB_SHARED void trb_balance(const trb_collapser *c, trbvh_u32 node, trbvh_u32 first_ref) {
+  const trbvh_u32 refs = trb_count(c->nodes[node].count);
+  TRB_GLOBAL trbvh_node *leaf = c->spare + first_ref;
+  TRB_GLOBAL trbvh_u32 *pair = c->words[0] + 2 * (size_t)first_ref, *root = pair + refs;
+  TRB_GLOBAL trbvh_u32 *first = c->words[1] + 2 * (size_t)first_ref, *count = first + refs, *stack = first;
+  trbvh_u32 leaves = 0, pairs = 0, inner = 1, waiting = 0, i, side;
+  stack[waiting++] = node;
+  while (waiting) {                                  /* takes it apart */
+    trbvh_node n = c->nodes[stack[--waiting]];
+    if (trb_count(n.count) == 1) {
+      leaf[leaves++] = n;
+    } else {
+      pair[pairs++] = n.first;
+      stack[waiting++] = n.first + 1;
+      stack[waiting++] = n.first;
+    }
+  }
+  TRBVH_ASSERT(leaves == refs && pairs + 1 == refs);
+  root[0] = node;
+  first[0] = 0;
+  count[0] = refs;
+  for (i = 0; i < pairs; i++) {                      /* halves it, parents before children */
+    for (side = 0; side < 2; side++) {
+      trbvh_u32 left = count[i] / 2, part = side ? count[i] - left : left, at = first[i] + (side ? left : 0);
+      if (part == 1) {
+        c->nodes[pair[i] + side] = leaf[at];
+      } else {
+        root[inner] = pair[i] + side;
+        first[inner] = at;
+        count[inner++] = part;
+      }
+    }
+  }
+  for (i = pairs; i-- > 0;) c->nodes[root[i]] = trb_parent(c->nodes[pair[i]], c->nodes[pair[i] + 1], pair[i], c->costs);
+}
+
+TRB_CORE int trb_too_deep(trbvh_u32 depth, trbvh_u32 word) {
+  trbvh_u32 count = trb_count(word);
+  return count > 1 && depth + trb_log2(count - 1) + 1 > TRBVH_MAX_DEPTH;
+}
+
+/* Node i, at this depth, once its children can stay within the bound. No tree of 2^31 references needs looking at
+ * above half of it. */
+TRB_CORE trbvh_node trb_bounded_node(const trb_collapser *c, trbvh_u32 i, trbvh_u32 depth, trbvh_u32 first_ref) {
+  trbvh_node node = c->nodes[i];
+  if (depth >= TRBVH_MAX_DEPTH / 2 && !trb_is_leaf(node.count) &&
+      (trb_too_deep(depth + 1, c->nodes[node.first].count) || trb_too_deep(depth + 1, c->nodes[node.first + 1].count))) {
+    trb_balance(c, i, first_ref);
+    node = c->nodes[i];
+  }
+  return node;
+}
+
+/* The primitives of a leaf, each once; returns how many. */
+TRB_CORE trbvh_u32 trb_leaf_prims(const trb_collapser *c, trbvh_node leaf, trbvh_u32 prims[TRB_MAX_LEAF]) {
+  trbvh_u32 stack[TRB_MAX_LEAF], waiting = 0, count = 0, i;
+  for (;;) {
+    if (trb_count(leaf.count) > 1) {
+      stack[waiting++] = leaf.first;
+      leaf = c->nodes[leaf.first + 1];
+      continue;
+    }
+    for (i = 0; c->split && i < count && prims[i] != leaf.first; i++) {}
+    if (!c->split || i == count) prims[count++] = leaf.first;
+    if (waiting == 0) return count;
+    leaf = c->nodes[stack[--waiting]];
+  }
+}
+
+TRB_CORE trbvh_u32 trb_count_prims(const trb_collapser *c, trbvh_node leaf) {
+  trbvh_u32 prims[TRB_MAX_LEAF];
+  return c->split ? trb_leaf_prims(c, leaf, prims) : trb_count(leaf.count);
+}
+
+/* A node's part in equation 1's sum, with half areas. */
+TRB_CORE TRB_REAL trb_sah_term(trbvh_node node, TRB_REAL weight) {
+  TRB_REAL x = (TRB_REAL)node.max[0] - node.min[0], y = (TRB_REAL)node.max[1] - node.min[1];
+  TRB_REAL z = (TRB_REAL)node.max[2] - node.min[2];
+  return weight * (x * y + z * (x + y));
+}
+
+/* Writes an inner node whose children will be pair number `pair`. */
+TRB_CORE void trb_emit_inner(const trb_collapser *c, trbvh_node node, trbvh_u32 dst, trbvh_u32 pair) {
+  node.first = 2 * pair;
+  node.count = 0;
+  c->out[dst] = node;
+}
+
+/* Writes a leaf whose primitives begin at `first`; returns how many they are. */
+TRB_CORE trbvh_u32 trb_emit_leaf(const trb_collapser *c, trbvh_node node, trbvh_u32 dst, trbvh_u32 first) {
+  trbvh_u32 prims[TRB_MAX_LEAF], i;
+  node.count = trb_leaf_prims(c, node, prims);
+  node.first = first;
+  c->out[dst] = node;
+  for (i = 0; i < node.count; i++) c->prims[first + i] = prims[i];
+  return node.count;
+}
+
+/* A subtree that one job collapses: what is known of it, what it came to, and its place in the result. */
+typedef struct trb_task {
+  trbvh_u32 node, depth, first_ref;
+  trbvh_u32 leaves, prims, max_depth;
+  trbvh_u32 dst, pair, first_prim;
+  TRB_REAL  sah;
+} trb_task;
+#define TRB_TASKS_MAX(refs) (TRBVH_MAX_DEPTH * ((refs) / TRB_BLOCK) + 1)
+
+/* An inner node of the walk: where its children stand, the pair number they get in the result, their depth. */
+typedef struct trb_visit { trbvh_u32 first, pair, depth; } trb_visit;
+
+/* First walk, below one task's node: counts. */
+TRB_SHARED void trb_count_task(const trb_collapser *c, TRB_GLOBAL trb_task *task) {
+  const trbvh_u32 first_ref = task->first_ref;
+  trbvh_u32 waiting = 0, child = task->node, siblings = 1, leaves = 0, prims = 0, max_depth = 0;
+  TRB_REAL sah = 0;
+  trb_visit stack[TRBVH_MAX_DEPTH + 1], v;
+  v.depth = task->depth;
+  for (;;) {
+    for (; siblings; siblings--, child++) {
+      const trbvh_node node = trb_bounded_node(c, child, v.depth, first_ref);
+      if (trb_is_leaf(node.count)) {
+        trbvh_u32 count = trb_count_prims(c, node);
+        leaves++;
+        prims += count;
+        sah += trb_sah_term(node, (TRB_REAL)c->cost_prim * count);
+        max_depth = TRB_MAX(v.depth, max_depth);
+      } else {
+        TRB_PREFETCH(&c->nodes[node.first]);
+        sah += trb_sah_term(node, c->cost_node);
+        stack[waiting].first = node.first;
+        stack[waiting++].depth = v.depth + 1;
+      }
+    }
+    if (waiting == 0) break;
+    v = stack[--waiting];
+    child = v.first;
+    siblings = 2;
+  }
+  task->leaves = leaves;
+  task->prims = prims;
+  task->max_depth = max_depth;
+  task->sah = sah;
+}
+
+/* First walk, above the tasks: finds them, returns how many, and sums up equation 1 above them. */
+TRB_SHARED trbvh_u32 trb_find_tasks(const trb_collapser *c, TRB_GLOBAL trb_task *tasks, TRB_REAL *sah) {
+  trbvh_u32 stack[TRBVH_MAX_DEPTH + 1], depths[TRBVH_MAX_DEPTH + 1], waiting = 0, refs = 0, node = 0, depth = 0, count = 0;
+  *sah = 0;
+  for (;;) {
+    const trbvh_node n = trb_bounded_node(c, node, depth, refs);
+    if (trb_count(n.count) > TRB_BLOCK) {
+      *sah += trb_sah_term(n, c->cost_node);
+      stack[waiting] = n.first + 1;
+      depths[waiting++] = ++depth;
+      node = n.first;
+    } else {
+      TRB_GLOBAL trb_task *task = &tasks[count++];
+      task->node = node;
+      task->depth = depth;
+      task->first_ref = refs;
+      refs += trb_count(n.count);
+      if (waiting == 0) return count;
+      node = stack[--waiting];
+      depth = depths[waiting];
+    }
+  }
+}
+
+/* Second walk, above the tasks: writes, and tells them their places. */
+TRB_SHARED void trb_emit_top(const trb_collapser *c, TRB_GLOBAL trb_task *task) {
+  trbvh_u32 stack[TRBVH_MAX_DEPTH + 1], dsts[TRBVH_MAX_DEPTH + 1], waiting = 0, pair = 1, prim = 0, node = 0, dst = 0;
+  for (;;) {
+    const trbvh_node n = c->nodes[node];
+    if (trb_count(n.count) > TRB_BLOCK) {
+      trb_emit_inner(c, n, dst, pair);
+      stack[waiting] = n.first + 1;
+      dsts[waiting++] = 2 * pair + 1;
+      node = n.first;
+      dst = 2 * pair++;
+    } else {
+      task->dst = dst;
+      task->pair = pair;
+      task->first_prim = prim;
+      pair += task->leaves - 1;
+      prim += task++->prims;
+      if (waiting == 0) return;
+      node = stack[--waiting];
+      dst = dsts[waiting];
+    }
+  }
+}
+
+/* Second walk, below one task's node: writes. The children of siblings get neighbouring pairs. */
+TRB_SHARED void trb_emit_task(const trb_collapser *c, trb_task task) {
+  trbvh_u32 waiting = 0, pair = task.pair, prim = task.first_prim, child = task.node, dst = task.dst, siblings = 1;
+  trb_visit stack[TRBVH_MAX_DEPTH + 1], v;
+  for (;;) {
+    for (; siblings; siblings--, child++, dst++) {
+      const trbvh_node node = c->nodes[child];
+      if (trb_is_leaf(node.count)) {
+        prim += trb_emit_leaf(c, node, dst, prim);
+      } else {
+        trb_emit_inner(c, node, dst, pair);
+        TRB_PREFETCH(&c->nodes[node.first]);
+        stack[waiting].first = node.first;
+        stack[waiting++].pair = pair++;
+      }
+    }
+    if (waiting == 0) break;
+    v = stack[--waiting];
+    child = v.first;
+    dst = 2 * v.pair;
+    siblings = 2;
+  }
+  TRBVH_ASSERT(pair - task.pair == task.leaves - 1 && prim - task.first_prim == task.prims);
+}
+
+// >>finish ---- triangles in leaf order -----------------------------------------------------------------------------
+TRB_CORE void trb_make_triangle(const trb_mesh *mesh, trbvh_u32 prim, TRB_GLOBAL trbvh_triangle *out) {
+  float v[3][3];
+  trbvh_u32 inexact = 0, vertex;
+  int k;
+  trb_load_triangle(mesh, prim, v, &vertex);
+  for (k = 0; k < 3; k++) {
+    float e1 = v[1][k] - v[0][k], e2 = v[2][k] - v[0][k];
+    out->v0[k] = v[0][k];
+    out->e1[k] = e1;
+    out->e2[k] = e2;
+    inexact |= (v[0][k] + e1 != v[1][k]) | (v[0][k] + e2 != v[2][k]);
+  }
+  out->prim = prim;
+  out->reserved0 = inexact;
+  out->reserved1 = 0;
+}
+
+/* Triangles first..end - 1. */
+TRB_SHARED void trb_make_triangles(const trb_mesh *mesh, const TRB_GLOBAL trbvh_u32 *prims, trbvh_u32 first, trbvh_u32 end,
+                                   TRB_GLOBAL trbvh_triangle *out) {
+  trbvh_u32 i;
+  for (i = first; i < end; i++) {
+    if (i + 3 * TRB_AHEAD < end) {
+      trb_prefetch_indices(mesh, prims[i + 3 * TRB_AHEAD]);
+      trb_prefetch_positions(mesh, prims[i + TRB_AHEAD]);
+    }
+    trb_make_triangle(mesh, prims[i], &out[i]);
+  }
+}
+
+// >>rays --------------------------------------------------------------------------------------------------------------
 /* A ray made ready for many tests. For boxes (Kay and Kajiya): which corner is nearer on each axis, and 1 / dir, with
  * infinities for zeros. For triangles (Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection", JCGT 2013): the
  * axis along which the ray is longest, now called z, and the shear that makes it the z axis.
@@ -676,15 +1562,6 @@ TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {
  * Triangles are tested in double where there is one: with float, those seen from the side, or from afar, would be hit
  * or missed by chance. */
 #define TRB_UNIT 5.9604645e-8f
-#ifndef TRB_REAL                         /* what triangle tests compute in */
-  #ifdef TRBVH_OPENCL_C
-    #define TRB_REAL float
-    #define TRB_NOISE 9.5367432e-7f      /* 16 units of its rounding */
-  #else
-    #define TRB_REAL double
-    #define TRB_NOISE 1.7763568e-15
-  #endif
-#endif
 #define TRB_ABS(x) ((x) < 0 ? -(x) : (x))
 typedef struct trb_ray {
   float    origin[3], inverse[3], tmin, tmax;
@@ -858,7 +1735,9 @@ TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbv
 }
 
 #ifndef TRBVH_OPENCL_C
-
+// ===================================================================================================================
+//   IN C: memory, jobs, the stages of a build, queries
+// ===================================================================================================================
 TRBVH_API unsigned trbvh_version(void) { return TRBVH_VERSION; }
 
 TRBVH_API const char *trbvh_result_text(trbvh_result result) {
@@ -891,16 +1770,6 @@ static void *trb_malloc(size_t size) {
   #endif
   return p;
 }
-#endif
-#ifndef TRBVH_ASSERT
-  #define TRBVH_ASSERT(x) ((void)0)
-#endif
-#if defined(__GNUC__)
-  #define TRB_PREFETCH(address) __builtin_prefetch(address)
-  #define TRB_ALIGNED(type) type __attribute__((aligned(64)))
-#else
-  #define TRB_PREFETCH(address) ((void)0)
-  #define TRB_ALIGNED(type) type
 #endif
 #define TRB_LINE 64u                     /* bytes in a cache line: what the block's parts are aligned to */
 
@@ -1126,20 +1995,10 @@ static double trb_ms(void) {
 #endif
 }
 
-// >>input ---- arguments made explicit and checked, primitives read whatever their form -----------------------------
-#define TRB_REFS_MAX      0x7FFFFFFFu    /* node indices are twice that */
-#ifndef TRB_PACKED_REFS                  /* up to here, sort keys hold both code and index. Lower in a test */
-  #define TRB_PACKED_REFS (1u << 24)
-#endif
-#define TRB_CODE_BITS     44u            /* of the Morton code in such a key, at most: four digits of the sort */
-#define TRB_DIGIT_BITS    11u
-#define TRB_DIGITS        (1u << TRB_DIGIT_BITS)
-#define TRB_SORT_BLOCK    65536u         /* keys a job counts and scatters */
-#define TRB_BLOCK         16384u         /* primitives, references or leaves a job works on: their nodes fit a cache */
-#define TRB_OPEN_MAX      200u           /* subtrees of a block that its neighbours complete: 2 (63 + 32) + 1 at most */
-#define TRB_SPLIT_STACK   64u            /* fragments of one triangle that wait to be split */
-#define TRB_AHEAD         32u            /* how far ahead random reads are asked for */
-#define TRB_NODE_BYTES    sizeof(trbvh_node)
+// >>input ---- arguments made explicit and checked, references made -----------------------------
+#define TRB_REFS_MAX   0x7FFFFFFFu       /* node indices are twice that */
+#define TRB_ROUNDS_MAX 28                /* of treelets: the last one's gamma is more than any tree has references */
+#define TRB_NODE_BYTES sizeof(trbvh_node)
 
 /* What one block of primitives came to. */
 typedef struct trb_block {
@@ -1150,22 +2009,6 @@ typedef struct trb_block {
   float      priority;                   /* the largest */
   trb_u64    splits;                     /* a sum, for the search for the scale */
 } trb_block;
-
-/* A subtree whose parent reaches beyond its block: what splits it from its right neighbour, and the place its parent
- * may put the two at. */
-typedef struct trb_open { trbvh_node node; trb_u64 split; uint32_t pair; } trb_open;
-typedef struct trb_range { uint32_t open_count; trb_open open[TRB_OPEN_MAX]; } trb_range;
-
-/* Subtrees that one job restructures, and the references in them. */
-typedef struct trb_group { uint32_t first_ref, refs, seeds; } trb_group;
-
-/* A subtree that one job collapses: what is known of it, what it came to, and its place in the result. */
-typedef struct trb_task {
-  uint32_t node, depth, first_ref;
-  uint32_t leaves, prims, max_depth;
-  double   sah;
-  uint32_t dst, pair, first_prim;
-} trb_task;
 
 typedef struct trb_build {
   trbvh_geometry        input;           /* with the defaults filled in */
@@ -1186,14 +2029,13 @@ typedef struct trb_build {
   trb_range            *ranges;
   trb_group            *groups;
   trb_task             *tasks;
-  uint32_t              block_count, group_count, task_count;
+  uint32_t              block_count, task_count;
   /* parameters of the jobs at work */
   float                 priority_unit;
   trb_u64               scale;
+  trb_key_form          key_form;
   int                   key_high;
-  uint32_t              key_bits, key_shift, digit_shift;
-  trb_u64               index_mask;
-  uint32_t              gamma;
+  uint32_t              digit_shift, gamma;
   trbvh                 tree;            /* the result, as it is made */
 } trb_build;
 
@@ -1269,6 +2111,17 @@ static trbvh_result trb_resolve_options(trb_build *b, const trbvh_options *optio
   return TRBVH_OK;
 }
 
+/* Keys of ref_max references at most. */
+static trb_key_form trb_choose_keys(uint32_t ref_max) {
+  trb_key_form form = {0, 31, 32};
+  if (ref_max <= TRB_PACKED_REFS) {
+    form.packed = 1;
+    form.shift = ref_max > 1 ? trb_log2(ref_max - 1) + 1 : 1;
+    form.bits = TRB_MIN(63 - form.shift, TRB_CODE_BITS);
+  }
+  return form;
+}
+
 /* How many references there may be. */
 static trbvh_result trb_resolve_size(trb_build *b) {
   trb_u64 extra = (trb_u64)((double)b->options.split_budget * b->input.count);
@@ -1277,6 +2130,7 @@ static trbvh_result trb_resolve_size(trb_build *b) {
     return trb_fail(b, TRBVH_TOO_LARGE, "%u primitives make more references than fit", b->input.count, 0, 0);
   b->split_max = (uint32_t)extra;
   b->ref_max = (uint32_t)refs;
+  b->key_form = trb_choose_keys(b->ref_max);
   return TRBVH_OK;
 }
 
@@ -1305,7 +2159,7 @@ static size_t trb_lay_out(trb_build *b, char *base) {
   TRB_PART(blocks,     trb_block,  blocks * sizeof(trb_block))
   TRB_PART(ranges,     trb_range,  blocks * sizeof(trb_range))
   TRB_PART(groups,     trb_group,  blocks * sizeof(trb_group))
-  TRB_PART(tasks,      trb_task,   (TRBVH_MAX_DEPTH * (n / TRB_BLOCK) + 1) * sizeof(trb_task))
+  TRB_PART(tasks,      trb_task,   TRB_TASKS_MAX(n) * sizeof(trb_task))
   TRB_PART(histograms, uint32_t,   trb_blocks(b->ref_max, TRB_SORT_BLOCK) * TRB_DIGITS * sizeof(uint32_t))
   #undef TRB_PART
   b->lists = (uint32_t *)(void *)b->refs;
@@ -1324,90 +2178,6 @@ TRBVH_API size_t trbvh_bytes_bound(const trbvh_geometry *geometry, const trbvh_o
   int fits = trb_resolve(&b, geometry, options) == TRBVH_OK && b.input.count > 0;
   if (scratch) *scratch = fits ? trb_lay_out(&b, NULL) : 0;
   return fits ? trb_result_size(&b, b.ref_max, b.ref_max) : 0;
-}
-
-static uint32_t trb_index(const trbvh_geometry *g, size_t i) {
-  uint32_t index;
-  uint16_t index16;
-  if (g->index_size == 2) {
-    memcpy(&index16, (const char *)g->indices + i * 2, 2);
-    return index16;
-  }
-  memcpy(&index, (const char *)g->indices + i * 4, 4);
-  return index;
-}
-
-/* The corners of triangle i; 0 where one of its indices is out of range, which vertex then tells. */
-static int trb_load_triangle(const trbvh_geometry *g, uint32_t i, float v[3][3], uint32_t *vertex) {
-  size_t k, corner = (size_t)i * 3;
-  for (k = 0; k < 3; k++) {
-    size_t position = corner + k;
-    if (g->indices) {
-      *vertex = trb_index(g, corner + k);
-      if (*vertex >= g->position_count) return 0;
-      position = *vertex;
-    }
-    memcpy(v[k], (const char *)g->positions + position * g->position_stride, 12);
-  }
-  return 1;
-}
-
-/* Asks for a triangle's indices, well before, and for its positions, once they are there. TRB_CORE, always inlined:
- * gcc takes a function that only prefetches for one without effect, and drops its calls. */
-TRB_CORE void trb_prefetch_indices(const trbvh_geometry *g, uint32_t i) {
-  if (g->indices) TRB_PREFETCH((const char *)g->indices + (size_t)i * 3 * g->index_size);
-}
-
-TRB_CORE void trb_prefetch_positions(const trbvh_geometry *g, uint32_t i) {
-  size_t k, corner = (size_t)i * 3;
-  for (k = 0; k < 3; k++) {
-    size_t position = g->indices ? trb_index(g, corner + k) : corner + k;
-    TRB_PREFETCH((const char *)g->positions + position * g->position_stride);
-  }
-}
-
-static trbvh_node trb_no_box(void) {
-  trbvh_node n;
-  int k;
-  for (k = 0; k < 3; k++) { n.min[k] = FLT_MAX; n.max[k] = -FLT_MAX; }
-  n.first = n.count = 0;
-  return n;
-}
-
-static void trb_include(trbvh_node *n, const float low[3], const float high[3]) {
-  int k;
-  for (k = 0; k < 3; k++) {
-    n->min[k] = TRB_MIN(low[k], n->min[k]);
-    n->max[k] = TRB_MAX(high[k], n->max[k]);
-  }
-}
-
-/* 0 for a triangle with a NaN or infinity. */
-static int trb_triangle_box(const float v[3][3], trbvh_node *box) {
-  int k, finite = 1;
-  for (k = 0; k < 3; k++) {
-    float low = TRB_MIN(v[0][k], v[1][k]), high = TRB_MAX(v[0][k], v[1][k]);
-    box->min[k] = TRB_MIN(v[2][k], low);
-    box->max[k] = TRB_MAX(v[2][k], high);
-    finite &= trb_finite(v[0][k]) & trb_finite(v[1][k]) & trb_finite(v[2][k]);
-  }
-  box->first = box->count = 0;
-  return finite;
-}
-
-static int trb_valid_box(trbvh_node box) {
-  int k, valid = 1;
-  for (k = 0; k < 3; k++) valid &= trb_finite(box.min[k]) & trb_finite(box.max[k]) & (box.min[k] <= box.max[k]);
-  return valid;
-}
-
-/* The box of primitive i: 1, or 0 where it is to be skipped, -1 where it has an index out of range. A triangle's
- * corners go to v. */
-static int trb_prim_box(const trbvh_geometry *g, uint32_t i, trbvh_node *box, float v[3][3], uint32_t *vertex) {
-  if (!g->boxes) return trb_load_triangle(g, i, v, vertex) ? trb_triangle_box((const float (*)[3])v, box) : -1;
-  memcpy(box->min, (const char *)g->boxes + (size_t)i * g->box_stride, 12);
-  memcpy(box->max, (const char *)g->boxes + (size_t)i * g->box_stride + 12, 12);
-  return trb_valid_box(*box);
 }
 
 /* The boxes of a block's primitives, without the invalid ones. */
@@ -1442,9 +2212,7 @@ static void trb_read_job(void *context, uint32_t index) {
 /* All references: what the blocks found, with their gaps closed. Fails for an index out of range. */
 static trbvh_result trb_read(trb_build *b) {
   trbvh_node bounds = trb_no_box();
-  float extent = 0;
   uint32_t i;
-  int k;
   b->block_count = trb_blocks(b->input.count, TRB_BLOCK);
   if (trb_run(&b->runner, b->block_count, trb_read_job, b)) return TRBVH_CANCELLED;
   for (i = 0; i < b->block_count; i++) {
@@ -1455,13 +2223,7 @@ static trbvh_result trb_read(trb_build *b) {
     b->stats.skipped_count += block->skipped;
     trb_include(&bounds, block->bounds.min, block->bounds.max);
   }
-  for (k = 0; k < 3; k++) {
-    float side = bounds.max[k] - bounds.min[k];
-    b->grid.origin[k] = bounds.min[k];
-    extent = TRB_MAX(side, extent);
-  }
-  b->grid.cells_per_unit = extent > 1e-30f && extent < FLT_MAX ? 2097152.0f / extent : 0;
-  b->grid.units_per_cell = extent * (1.0f / 2097152.0f);
+  b->grid = trb_make_grid(bounds);
   return TRBVH_OK;
 }
 
@@ -1477,13 +2239,8 @@ static void trb_close_gaps(trb_build *b, trbvh_node *refs) {
   }
 }
 
-// >>splits ---- the paper's section 4: fewer, better used references than a spatial split builder's -----------------
-/* Every triangle t gets s(t) = floor(D p(t)) splits, p its priority, with the largest scale D that keeps their sum
- * within the budget, found by bisection. Priorities are rounded to 24-bit integers first, so that all sums are exact
- * and their order does not matter. A triangle is cut at the most important median plane in its box; what is left of
- * its splits after this one goes to the halves by their longest sides; and so on down to no splits. */
-#define TRB_SCALE_BITS 36
-
+// >>stages ---- the algorithm's parts, as jobs, in its order ----------------------------------------------------------
+// ---- Splits ----
 static void trb_priority_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
   trb_block *block = &b->blocks[index];
@@ -1497,17 +2254,13 @@ static void trb_priority_job(void *context, uint32_t index) {
   }
 }
 
-/* Splits of reference i at the present scale. */
-static trb_u64 trb_splits(const trb_build *b, uint32_t i) {
-  return ((trb_u64)(uint32_t)(b->priorities[i] * b->priority_unit) * b->scale) >> TRB_SCALE_BITS;
-}
-
 static void trb_sum_splits_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
   trb_block *block = &b->blocks[index];
   uint32_t i;
   block->splits = 0;
-  for (i = block->start; i < block->start + block->count; i++) block->splits += trb_splits(b, i);
+  for (i = block->start; i < block->start + block->count; i++)
+    block->splits += trb_splits(b->priorities[i], b->priority_unit, b->scale);
 }
 
 static trb_u64 trb_sum_splits(trb_build *b, trb_u64 scale) {
@@ -1519,71 +2272,35 @@ static trb_u64 trb_sum_splits(trb_build *b, trb_u64 scale) {
   return sum;
 }
 
-static trb_u64 trb_ratio(trb_u64 a, trb_u64 b, trb_u64 c, trb_u64 largest) {       /* a b / c, up to largest */
-  double ratio = (double)a * (double)b / (double)c;
-  return ratio < (double)largest ? (trb_u64)ratio : largest;
-}
-
-/* The scale, by the paper's bisection between D_min = S_max / sum p and D_max = D_min S_max / S(D_min). */
+/* The largest scale within the budget. The first guess, the paper's D_min = S_max / sum p, is a little low, as every
+ * triangle's splits are rounded down: from there in steps that double, then by bisection. */
 static trb_u64 trb_find_scale(trb_build *b) {
-  const trb_u64 budget = b->split_max, largest = (trb_u64)1 << 40;
-  trb_u64 sum = trb_sum_splits(b, (trb_u64)1 << TRB_SCALE_BITS), low, high, made;
-  int step;
-  if (sum == 0) return 0;
-  low = trb_ratio(budget, (trb_u64)1 << TRB_SCALE_BITS, sum, largest);
-  made = trb_sum_splits(b, low);
-  high = made ? trb_ratio(low, budget, made, largest) : largest;
-  for (step = 0; step < 40 && high - low > low / 64 + 1; step++) {
-    trb_u64 middle = low + (high - low) / 2;
-    if (trb_sum_splits(b, middle) <= budget) low = middle;
+  const trb_u64 sum = trb_sum_splits(b, (trb_u64)1 << TRB_SCALE_BITS);
+  const double guess = sum ? (double)b->split_max / (double)sum * 68719476736.0 : 0;
+  uint32_t low = 0, high, step = 1;
+  while (low < TRB_SCALES - 1 && (double)trb_scale(low + 1) <= guess) low++;
+  if (trb_sum_splits(b, trb_scale(low)) > b->split_max) low = 0;       /* the guess is a rounded number */
+  for (high = low + step; high < TRB_SCALES && trb_sum_splits(b, trb_scale(high)) <= b->split_max; step *= 2) {
+    low = high;
+    high = low + step;
+  }
+  high = TRB_MIN(high, TRB_SCALES);
+  while (high - low > 1 && !b->runner.cancelled) {
+    uint32_t middle = low + (high - low) / 2;
+    if (trb_sum_splits(b, trb_scale(middle)) <= b->split_max) low = middle;
     else high = middle;
   }
-  return low;
-}
-
-/* Cuts one reference into up to splits + 1, left before right. */
-static uint32_t trb_split_reference(const trb_build *b, trbvh_node ref, uint32_t splits, trbvh_node *out) {
-  struct { trbvh_node box; uint32_t splits; } stack[TRB_SPLIT_STACK];
-  uint32_t top = 0, count = 0, vertex;
-  float v[3][3];
-  if (splits) trb_load_triangle(&b->input, ref.first, v, &vertex);
-  stack[top].box = ref;
-  stack[top++].splits = splits;
-  while (top) {
-    trbvh_node left, right;
-    trb_plane plane;
-    int in_left, in_right;
-    uint32_t rest = stack[--top].splits;
-    left = right = stack[top].box;
-    if (rest == 0 || top + 2 > TRB_SPLIT_STACK || !trb_choose_plane(left, b->grid, &plane)) {
-      out[count++] = left;
-      continue;
-    }
-    left.max[plane.axis] = right.min[plane.axis] = plane.position;
-    in_left = trb_clip((const float (*)[3])v, &left);
-    in_right = trb_clip((const float (*)[3])v, &right);
-    if (in_left && in_right) {
-      uint32_t share = trb_share(--rest, trb_longest_side(left), trb_longest_side(right));
-      stack[top].box = right;
-      stack[top++].splits = rest - share;
-      stack[top].box = left;
-      stack[top++].splits = share;
-    } else if (in_left || in_right) {                /* the triangle only touches the plane: try again within */
-      stack[top].box = in_left ? left : right;
-      stack[top++].splits = rest - 1;
-    } else {
-      out[count++] = stack[top].box;
-    }
-  }
-  return count;
+  return trb_scale(low);
 }
 
 static void trb_split_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
   trb_block *block = &b->blocks[index];
   uint32_t i, count = 0;
-  for (i = block->start; i < block->start + block->count; i++)
-    count += trb_split_reference(b, b->unsplit[i], (uint32_t)trb_splits(b, i), b->refs + block->split_start + count);
+  for (i = block->start; i < block->start + block->count; i++) {
+    uint32_t splits = (uint32_t)trb_splits(b->priorities[i], b->priority_unit, b->scale);
+    count += trb_split_reference(&b->input, b->grid, b->unsplit[i], splits, b->refs + block->split_start + count);
+  }
   block->count = count;
 }
 
@@ -1592,9 +2309,7 @@ static trbvh_result trb_split(trb_build *b) {
   float largest = 0;
   if (trb_run(&b->runner, b->block_count, trb_priority_job, b)) return TRBVH_CANCELLED;
   for (i = 0; i < b->block_count; i++) largest = TRB_MAX(b->blocks[i].priority, largest);
-  /* the power of two that takes the largest priority to 24 bits */
-  i = TRB_MAX(trb_bits(largest) >> 23, 24u);
-  b->priority_unit = trb_float((127u + 127u + 23u - i) << 23);
+  b->priority_unit = trb_priority_unit(largest);
   trb_sum_splits(b, trb_find_scale(b));
   if (b->runner.cancelled) return TRBVH_CANCELLED;
   for (i = 0; i < b->block_count; i++) {
@@ -1606,41 +2321,31 @@ static trbvh_result trb_split(trb_build *b) {
   return TRBVH_OK;
 }
 
-// >>sort ---- references along the Morton curve: a stable radix sort of 64-bit keys ---------------------------------
-/* Up to TRB_PACKED_REFS references a key holds the leading bits of the Morton code above the reference's index, so
- * that keys differ and carry what they sort: 44 bits of code up to 2^19 references, 39 at 2^24. Only the code's digits
- * are sorted; indices are in order already. Above that, all 63 bits count: references are sorted by the low 31 bits
- * of their codes, then by the high 32, with the same keys of half code, half index. */
-static int trb_packed(const trb_build *b) { return b->ref_count <= TRB_PACKED_REFS; }
-
+// ---- Keys and their sort ----
 static void trb_key_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
   uint32_t i = index * TRB_BLOCK, end = TRB_MIN(b->ref_count, i + TRB_BLOCK);
   for (; i < end; i++) {
-    uint32_t ref = b->key_high ? (uint32_t)b->keys[i] : i;
-    trb_u64 code = trb_morton(b->refs[ref], b->grid);
-    if (!trb_packed(b)) code = b->key_high ? code >> 31 : code & 0x7FFFFFFFu;
-    else code >>= 63 - b->key_bits;
-    b->keys[i] = code << b->key_shift | ref;
+    uint32_t ref = b->key_high ? trb_key_ref(b->keys[i], b->key_form) : i;
+    b->keys[i] = trb_key(b->refs[ref], ref, b->grid, b->key_form, b->key_high);
   }
+}
+
+static int trb_make_keys(trb_build *b, int high) {
+  b->key_high = high;
+  return trb_run(&b->runner, trb_blocks(b->ref_count, TRB_BLOCK), trb_key_job, b);
 }
 
 static void trb_histogram_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
-  uint32_t i = index * TRB_SORT_BLOCK, end = TRB_MIN(b->ref_count, i + TRB_SORT_BLOCK);
-  uint32_t *histogram = b->histograms + (size_t)index * TRB_DIGITS;
-  memset(histogram, 0, TRB_DIGITS * sizeof *histogram);
-  for (; i < end; i++) histogram[(b->keys[i] >> b->digit_shift) & (TRB_DIGITS - 1)]++;
+  uint32_t first = index * TRB_SORT_BLOCK, count = TRB_MIN(b->ref_count - first, TRB_SORT_BLOCK);
+  trb_count_digits(b->keys + first, count, b->digit_shift, b->histograms + (size_t)index * TRB_DIGITS);
 }
 
 static void trb_scatter_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
-  uint32_t i = index * TRB_SORT_BLOCK, end = TRB_MIN(b->ref_count, i + TRB_SORT_BLOCK);
-  uint32_t *next = b->histograms + (size_t)index * TRB_DIGITS;
-  for (; i < end; i++) {
-    trb_u64 key = b->keys[i];
-    b->sorted[next[(key >> b->digit_shift) & (TRB_DIGITS - 1)]++] = key;
-  }
+  uint32_t first = index * TRB_SORT_BLOCK, count = TRB_MIN(b->ref_count - first, TRB_SORT_BLOCK);
+  trb_scatter_keys(b->keys + first, count, b->digit_shift, b->histograms + (size_t)index * TRB_DIGITS, b->sorted);
 }
 
 /* By bits [shift, shift + bits) of the keys. */
@@ -1648,14 +2353,8 @@ static int trb_sort(trb_build *b, uint32_t shift, uint32_t bits) {
   const uint32_t blocks = trb_blocks(b->ref_count, TRB_SORT_BLOCK);
   for (b->digit_shift = shift; b->digit_shift < shift + bits; b->digit_shift += TRB_DIGIT_BITS) {
     trb_u64 *swap = b->keys;
-    uint32_t digit, block, start = 0;
     if (trb_run(&b->runner, blocks, trb_histogram_job, b)) return 1;
-    for (digit = 0; digit < TRB_DIGITS; digit++)
-      for (block = 0; block < blocks; block++) {
-        uint32_t *count = b->histograms + (size_t)block * TRB_DIGITS + digit, n = *count;
-        *count = start;
-        start += n;
-      }
+    trb_place_digits(b->histograms, blocks);
     if (trb_run(&b->runner, blocks, trb_scatter_job, b)) return 1;
     b->keys = b->sorted;
     b->sorted = swap;
@@ -1663,541 +2362,87 @@ static int trb_sort(trb_build *b, uint32_t shift, uint32_t bits) {
   return 0;
 }
 
-static int trb_key_jobs(trb_build *b, int high) {
-  b->key_high = high;
-  return trb_run(&b->runner, trb_blocks(b->ref_count, TRB_BLOCK), trb_key_job, b);
-}
-
-static trbvh_result trb_make_keys(trb_build *b) {
-  b->key_bits = 31;
-  b->key_shift = 32;
-  if (trb_packed(b)) {
-    b->key_shift = b->ref_count > 1 ? trb_log2(b->ref_count - 1) + 1 : 1;
-    b->key_bits = TRB_MIN(63 - b->key_shift, TRB_CODE_BITS);
-  }
-  return trb_key_jobs(b, 0) ? TRBVH_CANCELLED : TRBVH_OK;
-}
-
 static trbvh_result trb_sort_keys(trb_build *b) {
-  int cancelled = trb_sort(b, b->key_shift, b->key_bits);
-  if (!trb_packed(b)) cancelled = cancelled || trb_key_jobs(b, 1) || trb_sort(b, 32, 32);
+  int cancelled = trb_sort(b, b->key_form.shift, b->key_form.bits);
+  if (!b->key_form.packed) cancelled = cancelled || trb_make_keys(b, 1) || trb_sort(b, 32, 32);
   return cancelled ? TRBVH_CANCELLED : TRBVH_OK;
 }
 
-// >>hierarchy ---- the linear BVH (Karras 2012, "Maximizing Parallelism in the Construction of BVHs, Octrees...") ----
-/* The binary radix tree over the sorted keys: every node splits its range where the highest bit changes. On a CPU one
- * pass over the leaves is fastest: neighbours differ by exclusive or, a smaller value splits deeper; subtrees wait on
- * a stack for a shallower split to their right, which makes them the left child of what follows them (the Cartesian
- * tree). Blocks of leaves are built alone; subtrees whose parents reach beyond their block stay open, and the same
- * pass over them makes the top of the tree. Children stand before their parents, in cache lines of their own. */
-typedef struct trb_forest {
-  trbvh_node *nodes;
-  trb_costs   costs;
-  trb_u64     left_split;                /* between the bottom of the stack and what is left of it */
-  uint32_t    next_pair, height;
-  trb_open    stack[TRB_OPEN_MAX];
-  trb_range  *range;                     /* where subtrees that stay open go */
-} trb_forest;
-
-static trbvh_node trb_join(trb_forest *f, trbvh_node left, trbvh_node right, uint32_t pair) {
-  f->nodes[2 * pair] = left;
-  f->nodes[2 * pair + 1] = right;
-  return trb_parent(left, right, 2 * pair, f->costs);
-}
-
-static void trb_leave_open(trb_forest *f, const trb_open *subtree) {
-  TRBVH_ASSERT(f->range->open_count < TRB_OPEN_MAX);
-  f->range->open[f->range->open_count++] = *subtree;
-}
-
-/* The next subtree from the left; split is between it and its right neighbour; pair is for their parent, or 0. */
-static void trb_push(trb_forest *f, trbvh_node node, trb_u64 split, uint32_t pair) {
-  trb_open *top;
-  while (f->height && f->stack[f->height - 1].split <= split) {
-    top = &f->stack[--f->height];
-    if (f->height || f->left_split >= top->split) {
-      node = trb_join(f, top->node, node, top->pair ? top->pair : f->next_pair++);
-    } else {                             /* their parent begins left of the block */
-      f->left_split = top->split;
-      trb_leave_open(f, top);
-    }
-  }
-  TRBVH_ASSERT(f->height < TRB_OPEN_MAX);
-  top = &f->stack[f->height++];
-  top->node = node;
-  top->split = split;
-  top->pair = pair;
-}
-
-#define TRB_NO_SPLIT (~(trb_u64)0)       /* shallower than any: the end of the scene */
-
-/* What splits sorted leaf i from leaf i + 1: larger is shallower. */
-static trb_u64 trb_split_after(const trb_build *b, uint32_t i) {
-  trb_u64 a, c, code;
-  if (i >= b->ref_count - 1) return TRB_NO_SPLIT;     /* also for 0 - 1 */
-  a = b->keys[i];
-  c = b->keys[i + 1];
-  if (trb_packed(b)) return a ^ c;
-  code = trb_morton(b->refs[(uint32_t)a], b->grid) ^ trb_morton(b->refs[(uint32_t)c], b->grid);
-  return code ? code | (trb_u64)1 << 63 : (uint32_t)(a ^ c);
-}
-
-static void trb_forest_start(trb_forest *f, const trb_build *b, trb_u64 left_split, uint32_t pair, trb_range *range) {
-  f->nodes = b->nodes;
-  f->costs = b->costs;
-  f->left_split = left_split;
-  f->next_pair = pair;
-  f->height = 0;
-  f->range = range;
+// ---- Hierarchy ----
+static trb_curve trb_sorted_curve(const trb_build *b) {
+  trb_curve curve;
+  curve.keys = b->keys;
+  curve.refs = b->refs;
+  curve.grid = b->grid;
+  curve.form = b->key_form;
+  curve.count = b->ref_count;
+  return curve;
 }
 
 static void trb_hierarchy_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
-  uint32_t first = index * TRB_BLOCK, end = TRB_MIN(b->ref_count, first + TRB_BLOCK), i;
-  trb_range *range = &b->ranges[index];
-  trb_forest f;
-  range->open_count = 0;
-  trb_forest_start(&f, b, trb_split_after(b, first - 1), first + 1, range);
-  for (i = first; i < end; i++) {
-    trbvh_node ref = b->refs[b->keys[i] & b->index_mask];
-    if (i + TRB_AHEAD < end) TRB_PREFETCH(&b->refs[b->keys[i + TRB_AHEAD] & b->index_mask]);
-    trb_push(&f, trb_reference(ref, b->costs), trb_split_after(b, i), 0);
-  }
-  for (i = 0; i < f.height; i++) trb_leave_open(&f, &f.stack[i]);
-  for (i = 0; i < range->open_count; i++) range->open[i].pair = f.next_pair + i;
+  const uint32_t first = index * TRB_BLOCK, end = TRB_MIN(b->ref_count, first + TRB_BLOCK);
+  const trb_curve curve = trb_sorted_curve(b);
+  trb_build_block(&curve, first, end, b->costs, b->nodes, &b->ranges[index]);
 }
 
-/* Pairs of siblings are numbered from 1, and stand at twice that; the root is nodes[0]. */
 static trbvh_result trb_build_hierarchy(trb_build *b) {
   const uint32_t blocks = trb_blocks(b->ref_count, TRB_BLOCK);
-  uint32_t i, k;
-  trb_forest f;
-  b->index_mask = trb_packed(b) ? ((trb_u64)1 << b->key_shift) - 1 : 0xFFFFFFFFu;
   if (trb_run(&b->runner, blocks, trb_hierarchy_job, b)) return TRBVH_CANCELLED;
-  trb_forest_start(&f, b, TRB_NO_SPLIT, 0, NULL);
-  for (i = 0; i < blocks; i++)
-    for (k = 0; k < b->ranges[i].open_count; k++) {
-      const trb_open *open = &b->ranges[i].open[k];
-      trb_push(&f, open->node, open->split, open->pair);
-    }
-  TRBVH_ASSERT(f.height == 1);
-  b->nodes[0] = f.stack[0].node;
+  trb_build_top(b->nodes, b->ranges, blocks, b->costs);
   return TRBVH_OK;
 }
 
-// >>treelets ---- restructuring by dynamic programming (paper, section 3) -------------------------------------------
-/* In round r every node of 7 * 2^r references or more becomes the root of a treelet once, after both its children's
- * subtrees have been through round r. Its two children are the first treelet leaves; five times, the one of largest
- * area is replaced by its own children. If the best topology over the seven leaves beats the present one, the root,
- * which keeps its place, gets it; the six pairs of siblings are used again. Nothing else is said about the order, and
- * nothing depends on it: numbers of nodes never break a tie.
- *
- * Here, subtrees of up to TRB_BLOCK references are jobs. A job sorts its treelet roots by height, roots of one height
- * being independent, and takes TRB_LANES of them at a time through the dynamic program; then the few roots above all
- * jobs go the same way. */
-typedef struct trb_treelets {
-  float    leaves[TRB_TREELET * TRB_LEAF_VALUES * TRB_LANES];
-  float    table[TRB_SUBSETS * TRB_LANES + 16];  /* padded: leaves and table otherwise fall on the same cache sets */
-  float    area[TRB_TREELET - 1][TRB_LANES];     /* of the nodes expanded, the root first */
-  uint32_t slot[TRB_TREELET][TRB_LANES];         /* the treelet leaves' nodes ... */
-  uint32_t key[TRB_TREELET][TRB_LANES];          /* ... and their rank for expansion */
-  uint32_t pair[TRB_TREELET - 1][TRB_LANES];     /* where the children of the expanded nodes stand */
-  uint32_t parent[TRB_TREELET - 1][TRB_LANES];   /* which slot was expanded: left child there, right child in a new one */
-} trb_treelets;
-
-static void trb_expand(const trbvh_node *nodes, trb_treelets *t, uint32_t lane, uint32_t step, uint32_t slot, uint32_t node) {
-  uint32_t pair = nodes[node].first;
-  t->area[step][lane] = trb_area(nodes[node]);
-  t->pair[step][lane] = pair;
-  t->parent[step][lane] = slot;
-  t->slot[slot][lane] = pair;
-  t->slot[step + 1][lane] = pair + 1;
-  t->key[slot][lane] = trb_expand_key(nodes[pair], slot);
-  t->key[step + 1][lane] = trb_expand_key(nodes[pair + 1], step + 1);
-}
-
-/* Steps outside, lanes inside, so that one lane's cache misses hide behind the others' work. */
-static void trb_form_treelets(const trbvh_node *nodes, trb_treelets *t, const uint32_t *roots, uint32_t lanes) {
-  uint32_t lane, step, i;
-  for (lane = 0; lane < lanes; lane++) trb_expand(nodes, t, lane, 0, 0, roots[lane]);
-  for (step = 1; step < TRB_TREELET - 1; step++)
-    for (lane = 0; lane < lanes; lane++) {
-      uint32_t best = t->key[0][lane];
-      for (i = 1; i <= step; i++) best = TRB_MAX(t->key[i][lane], best);
-      i = TRB_TREELET - (best & 7u);
-      trb_expand(nodes, t, lane, step, i, t->slot[i][lane]);
-    }
-  for (i = 0; i < TRB_TREELET; i++)
-    for (lane = 0; lane < lanes; lane++) {
-      const trbvh_node *leaf = &nodes[t->slot[i][lane]];
-      float *value = &t->leaves[i * TRB_LEAF_VALUES * TRB_LANES + lane];
-      value[0 * TRB_LANES] = leaf->min[0];
-      value[1 * TRB_LANES] = leaf->min[1];
-      value[2 * TRB_LANES] = leaf->min[2];
-      value[3 * TRB_LANES] = leaf->max[0];
-      value[4 * TRB_LANES] = leaf->max[1];
-      value[5 * TRB_LANES] = leaf->max[2];
-      value[6 * TRB_LANES] = (float)trb_count(leaf->count);
-      value[7 * TRB_LANES] = trb_cost(leaf->count);
-    }
-}
-
-/* The cost of a treelet as it is, on the scale of trb_treelet_costs; uses up what it is told about the leaves. */
-static float trb_present_cost(trb_treelets *t, uint32_t lane, trb_costs costs) {
-  float cost[TRB_TREELET] = {0, 0, 0, 0, 0, 0, 0};
-  uint32_t step = TRB_TREELET - 1;
-  while (step--) {                                   /* last expanded first: children before parents */
-    uint32_t left = t->parent[step][lane], right = step + 1;
-    float *l = &t->leaves[left * TRB_LEAF_VALUES * TRB_LANES + lane];
-    const float *r = &t->leaves[right * TRB_LEAF_VALUES * TRB_LANES + lane];
-    float area = t->area[step][lane];
-    l[6 * TRB_LANES] += r[6 * TRB_LANES];
-    l[7 * TRB_LANES] += r[7 * TRB_LANES];
-    cost[left] = area + (cost[left] + cost[right]);
-    if (l[6 * TRB_LANES] <= (float)costs.max_leaf) {
-      float leaf = costs.ratio * area * l[6 * TRB_LANES] - l[7 * TRB_LANES];
-      cost[left] = TRB_MIN(leaf, cost[left]);
-    }
-  }
-  return cost[0];
-}
-
-/* The six pairs a treelet may use, last one first. */
-static void trb_sort_pairs(const trb_treelets *t, uint32_t lane, uint32_t pairs[TRB_TREELET - 1]) {
-  uint32_t i, k;
-  for (i = 0; i < TRB_TREELET - 1; i++) {
-    uint32_t pair = t->pair[i][lane];
-    for (k = i; k > 0 && pairs[k - 1] < pair; k--) pairs[k] = pairs[k - 1];
-    pairs[k] = pair;
-  }
-}
-
-/* Gives the root of a treelet the best topology. Nodes are laid out as the hierarchy does it, children before parents
- * and left before right, which is the order that the collapse walks through backwards. */
-static void trb_rebuild_treelet(trbvh_node *nodes, const trb_treelets *t, uint32_t lane, uint32_t root, trb_costs costs) {
-  trbvh_node leaf[TRB_TREELET];
-  uint32_t pairs[TRB_TREELET - 1], node[TRB_TREELET - 1], i, side, waiting = 0;
-  uint32_t stack_node[TRB_TREELET], stack_subset[TRB_TREELET];
-  for (i = 0; i < TRB_TREELET; i++) leaf[i] = nodes[t->slot[i][lane]];
-  trb_sort_pairs(t, lane, pairs);
-  stack_node[waiting] = root;
-  stack_subset[waiting++] = TRB_SUBSETS - 1;
-  for (i = 0; waiting; i++) {                        /* inner nodes from the root down, their children at pairs[i] */
-    uint32_t subset = stack_subset[--waiting], part = trb_partition(t->table + lane, subset);
-    node[i] = stack_node[waiting];
-    for (side = 0; side < 2; side++, part ^= subset) {
-      if (TRB_SINGLE(part)) {
-        nodes[pairs[i] + side] = leaf[trb_log2(part)];
-      } else {
-        stack_node[waiting] = pairs[i] + side;
-        stack_subset[waiting++] = part;
-      }
-    }
-  }
-  while (i--) nodes[node[i]] = trb_parent(nodes[pairs[i]], nodes[pairs[i] + 1], pairs[i], costs);
-}
-
-/* Up to TRB_LANES roots, none above another. */
-static void trb_restructure(trbvh_node *nodes, trb_treelets *t, const uint32_t *roots, uint32_t lanes, trb_costs costs) {
-  uint32_t lane;
-  trb_form_treelets(nodes, t, roots, lanes);
-  for (lane = 0; lane < TRB_LANES; lane++) trb_treelet_costs(t->leaves + lane, t->table + lane, costs);
-  for (lane = 0; lane < lanes; lane++) {
-    float best = t->table[(TRB_SUBSETS - 1) * TRB_LANES + lane];
-    trbvh_node *root = &nodes[roots[lane]];
-    if (trb_improves(best, trb_present_cost(t, lane, costs))) trb_rebuild_treelet(nodes, t, lane, roots[lane], costs);
-    else if (trb_count(root->count) <= costs.max_leaf)         /* cheaper all the same, if a subtree below is */
-      *root = trb_parent(nodes[root->first], nodes[root->first + 1], root->first, costs);
-  }
-}
-
-/* All nodes of at least `smallest` references below the seeds, lowest first. space: four times `room` words, where
- * room bounds their number, with the seeds at its start. */
-static void trb_restructure_below(trb_build *b, uint32_t *space, uint32_t room, uint32_t seeds, uint32_t smallest) {
-  const trbvh_node *nodes = b->nodes;
-  uint32_t *node = space, *parent = space + room, *height = parent + room, *sorted = height + room, *start = parent;
-  uint32_t count = seeds, highest = 0, i, k;
-  TRB_ALIGNED(trb_treelets) t;                       /* vectors across cache lines: 20 % slower */
-  memset(&t, 0, sizeof t);
-  for (i = 0; i < seeds; i++) parent[i] = TRBVH_NONE;
-  for (i = 0; i < count; i++) {                      /* breadth first, parents before children */
-    height[i] = 0;
-    for (k = 0; k < 2; k++) {
-      uint32_t child = nodes[node[i]].first + k;
-      if (trb_count(nodes[child].count) < smallest) continue;
-      parent[count] = i;
-      node[count++] = child;
-    }
-  }
-  TRBVH_ASSERT(count <= room);
-  for (i = count; i-- > 0;) {
-    highest = TRB_MAX(height[i], highest);
-    if (parent[i] != TRBVH_NONE) height[parent[i]] = TRB_MAX(height[i] + 1, height[parent[i]]);
-  }
-  for (i = 0; i <= highest + 1; i++) start[i] = 0;   /* counting sort; parents are no longer needed */
-  for (i = 0; i < count; i++) start[height[i] + 1]++;
-  for (i = 0; i < highest; i++) start[i + 1] += start[i];
-  for (i = 0; i < count; i++) sorted[start[height[i]]++] = node[i];
-  for (i = 0, k = 0; k <= highest; k++)              /* start[k] has moved to the end of height k */
-    for (; i < start[k]; i += TRB_MIN(TRB_LANES, start[k] - i))
-      trb_restructure(b->nodes, &t, sorted + i, TRB_MIN(TRB_LANES, start[k] - i), b->costs);
-}
-
+// ---- Treelets ----
 static void trb_treelet_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
-  const trb_group *group = &b->groups[index];
-  TRBVH_ASSERT(group->refs < 2 * TRB_BLOCK);
-  trb_restructure_below(b, b->lists + 4 * (size_t)group->first_ref, group->refs, group->seeds, b->gamma);
+  trb_restructure_group(b->nodes, b->lists, b->groups[index], b->gamma, b->costs);
 }
 
-/* One round: groups of subtrees, then the nodes above them. */
 static int trb_round(trb_build *b, uint32_t gamma) {
-  uint32_t *top = (uint32_t *)(void *)b->keys, top_count = 0, i, first_ref = 0;
-  trb_group *group = NULL;
-  const uint32_t above = TRB_MAX(TRB_BLOCK + 1, gamma);
+  uint32_t groups = trb_find_groups(b->nodes, (uint32_t *)(void *)b->keys, b->lists, b->groups, gamma);
   b->gamma = gamma;
-  b->group_count = 0;
-  top[top_count++] = 0;
-  for (i = 0; i < top_count; i++) {
-    const trbvh_node *node = &b->nodes[top[i]];
-    uint32_t count = trb_count(node->count);
-    if (count >= above) {
-      top[top_count++] = node->first;
-      top[top_count++] = node->first + 1;
-    } else if (count >= gamma) {
-      if (!group || group->refs >= TRB_BLOCK) {
-        group = &b->groups[b->group_count++];
-        group->first_ref = first_ref;
-        group->refs = group->seeds = 0;
-      }
-      b->lists[4 * (size_t)group->first_ref + group->seeds++] = top[i];
-      group->refs += count;
-      first_ref += count;
-    }
-  }
-  if (trb_run(&b->runner, b->group_count, trb_treelet_job, b)) return 1;
-  if (trb_count(b->nodes[0].count) >= above) {
-    b->lists[0] = 0;
-    trb_restructure_below(b, b->lists, b->ref_count, 1, above);
-  }
+  if (trb_run(&b->runner, groups, trb_treelet_job, b)) return 1;
+  trb_restructure_top(b->nodes, b->lists, b->ref_count, gamma, b->costs);
   return 0;
 }
 
-// >>collapse ---- subtrees that are cheaper as leaves become leaves, and the tree moves into its final layout --------
-/* Every small node knows already whether it is better as a leaf (equation 2, trb_parent); the topmost such nodes
- * become leaves. Two walks from the root down, in the same order: the first counts leaves and
- * primitives, the second writes; in between, the result is allocated and prefix sums tell every job its place. Right
- * before left, because the hierarchy laid children before parents: both walks then run through memory backwards, one
- * line after the other.
- *
- * The depth bound: a node at depth d with n references can always be made a balanced subtree that ends at depth
- * d + ceil(log2 n). Where a child could no longer be made so within TRBVH_MAX_DEPTH, its parent still can, and is. As
- * this holds at the root, it holds everywhere. */
-
-/* The balanced tree over `count` leaves; returns its root, and takes its inner nodes' places from pairs. */
-static trbvh_node trb_balanced(trb_build *b, const trbvh_node *leaves, uint32_t count, const uint32_t **pairs) {
-  uint32_t half = count / 2, pair;
-  trbvh_node left, right;
-  if (count == 1) return leaves[0];
-  pair = *(*pairs)++;
-  left = trb_balanced(b, leaves, half, pairs);
-  right = trb_balanced(b, leaves + half, count - half, pairs);
-  b->nodes[pair] = left;
-  b->nodes[pair + 1] = right;
-  return trb_parent(left, right, pair, b->costs);
-}
-
-/* Rebuilds a subtree, the first of whose references is the first_ref-th of the tree. */
-static void trb_balance(trb_build *b, uint32_t node, uint32_t first_ref) {
-  uint32_t count = trb_count(b->nodes[node].count), leaves = 0, inner = 0, waiting = 0;
-  trbvh_node *leaf = b->refs + first_ref;            /* free by now, as are the keys */
-  uint32_t *pairs = (uint32_t *)(void *)(b->keys + first_ref);
-  uint32_t *stack = (uint32_t *)(void *)(b->sorted + first_ref);
-  const uint32_t *next = pairs;
-  stack[waiting++] = node;
-  while (waiting) {
-    trbvh_node n = b->nodes[stack[--waiting]];
-    if (trb_count(n.count) == 1) {
-      leaf[leaves++] = n;
-    } else {
-      pairs[inner++] = n.first;
-      stack[waiting++] = n.first + 1;
-      stack[waiting++] = n.first;
-    }
+static trbvh_result trb_restructure_rounds(trb_build *b, float share) {
+  int32_t round;
+  for (round = 0; round < b->options.treelet_rounds && round < TRB_ROUNDS_MAX; round++) {
+    uint32_t gamma = (uint32_t)TRB_TREELET << round;
+    if (gamma > b->ref_count) break;
+    if (trb_stage(&b->runner, share * (round ? 0.2f : 0.6f)) || trb_round(b, gamma)) return TRBVH_CANCELLED;
   }
-  TRBVH_ASSERT(leaves == count && inner + 1 == count);
-  b->nodes[node] = trb_balanced(b, leaf, count, &next);
+  return TRBVH_OK;
 }
 
-static int trb_too_deep(uint32_t depth, trbvh_u32 word) {
-  uint32_t count = trb_count(word);
-  return count > 1 && depth + trb_log2(count - 1) + 1 > TRBVH_MAX_DEPTH;
+// ---- Collapse ----
+static trb_collapser trb_start_collapse(const trb_build *b) {
+  trb_collapser c;
+  c.nodes = b->nodes;
+  c.spare = b->refs;                                 /* free by now, as are the keys */
+  c.words[0] = (uint32_t *)(void *)b->keys;
+  c.words[1] = (uint32_t *)(void *)b->sorted;
+  c.costs = b->costs;
+  c.cost_node = b->options.cost_node;
+  c.cost_prim = b->options.cost_prim;
+  c.split = b->split_max != 0;
+  c.out = (trbvh_node *)(uintptr_t)b->tree.nodes;
+  c.prims = (uint32_t *)(uintptr_t)b->tree.prims;
+  return c;
 }
 
-/* Node i, at this depth, once its children can stay within the bound. No tree of 2^31 references needs looking at
- * above half of it. */
-static trbvh_node trb_bounded_node(trb_build *b, uint32_t i, uint32_t depth, uint32_t first_ref) {
-  trbvh_node node = b->nodes[i];
-  if (depth >= TRBVH_MAX_DEPTH / 2 && !trb_is_leaf(node.count) &&
-      (trb_too_deep(depth + 1, b->nodes[node.first].count) || trb_too_deep(depth + 1, b->nodes[node.first + 1].count))) {
-    trb_balance(b, i, first_ref);
-    node = b->nodes[i];
-  }
-  return node;
-}
-
-/* The primitives of a leaf, each once; returns how many. */
-static uint32_t trb_leaf_prims(const trb_build *b, const trbvh_node *leaf, uint32_t *prims) {
-  const trbvh_node *stack[TRB_MAX_LEAF];
-  uint32_t waiting = 0, count = 0, i;
-  for (;;) {
-    if (trb_count(leaf->count) > 1) {
-      stack[waiting++] = &b->nodes[leaf->first];
-      leaf = &b->nodes[leaf->first + 1];
-      continue;
-    }
-    for (i = 0; b->split_max && i < count && prims[i] != leaf->first; i++) {}
-    if (!b->split_max || i == count) prims[count++] = leaf->first;
-    if (waiting == 0) return count;
-    leaf = stack[--waiting];
-  }
-}
-
-/* An inner node of the walk: where its children stand, the pair number they get in the result, their depth. */
-typedef struct trb_visit { uint32_t first, pair, depth; } trb_visit;
-
-/* First walk, below one task's node: counts. */
 static void trb_count_job(void *context, uint32_t index) {
-  trb_build *b = (trb_build *)context;
-  trb_task *task = &b->tasks[index];
-  trb_visit stack[TRBVH_MAX_DEPTH + 1], v;
-  uint32_t waiting = 0, prims[TRB_MAX_LEAF], child = task->node, siblings = 1;
-  v.depth = task->depth;
-  task->leaves = task->prims = 0;
-  for (;;) {
-    for (; siblings; siblings--, child++) {
-      const trbvh_node node = trb_bounded_node(b, child, v.depth, task->first_ref);
-      if (trb_is_leaf(node.count)) {
-        task->leaves++;
-        task->prims += b->split_max ? trb_leaf_prims(b, &node, prims) : trb_count(node.count);
-      } else {
-        TRB_PREFETCH(&b->nodes[node.first]);
-        stack[waiting].first = node.first;
-        stack[waiting++].depth = v.depth + 1;
-      }
-    }
-    if (waiting == 0) return;
-    v = stack[--waiting];
-    child = v.first;
-    siblings = 2;
-  }
+  const trb_build *b = (const trb_build *)context;
+  const trb_collapser c = trb_start_collapse(b);
+  trb_count_task(&c, &b->tasks[index]);
 }
 
-/* First walk, above the tasks: finds them. */
-static void trb_find_tasks(trb_build *b) {
-  uint32_t stack[TRBVH_MAX_DEPTH + 1], depths[TRBVH_MAX_DEPTH + 1], waiting = 0, refs = 0, node = 0, depth = 0;
-  b->task_count = 0;
-  for (;;) {
-    const trbvh_node n = trb_bounded_node(b, node, depth, refs);
-    if (trb_count(n.count) > TRB_BLOCK) {
-      stack[waiting] = n.first + 1;
-      depths[waiting++] = ++depth;
-      node = n.first;
-    } else {
-      trb_task *task = &b->tasks[b->task_count++];
-      task->node = node;
-      task->depth = depth;
-      task->first_ref = refs;
-      refs += trb_count(n.count);
-      if (waiting == 0) break;
-      node = stack[--waiting];
-      depth = depths[waiting];
-    }
-  }
-}
-
-static trbvh_node *trb_out(const trb_build *b, uint32_t i) { return (trbvh_node *)(uintptr_t)&b->tree.nodes[i]; }
-
-/* Equation 1's sum, with half areas, in double. */
-static double trb_sah_term(const trbvh_node *node, double weight) {
-  double x = (double)node->max[0] - node->min[0], y = (double)node->max[1] - node->min[1];
-  double z = (double)node->max[2] - node->min[2];
-  return weight * (x * y + z * (x + y));
-}
-
-/* Writes an inner node whose children will be pair number `pair`. */
-static double trb_emit_inner(const trb_build *b, trbvh_node node, uint32_t dst, uint32_t pair) {
-  node.first = 2 * pair;
-  node.count = 0;
-  *trb_out(b, dst) = node;
-  return trb_sah_term(&node, b->options.cost_node);
-}
-
-/* Writes a leaf whose primitives begin at `prim`. */
-static double trb_emit_leaf(const trb_build *b, trbvh_node node, uint32_t dst, uint32_t prim) {
-  node.count = trb_leaf_prims(b, &node, (uint32_t *)(uintptr_t)b->tree.prims + prim);
-  node.first = prim;
-  *trb_out(b, dst) = node;
-  return trb_sah_term(&node, (double)b->options.cost_prim * node.count);
-}
-
-/* Second walk, below one task's node: writes. The children of siblings get neighbouring pairs. */
 static void trb_emit_job(void *context, uint32_t index) {
-  trb_build *b = (trb_build *)context;
-  trb_task *task = &b->tasks[index];
-  uint32_t waiting = 0, pair = task->pair, prim = task->first_prim, child = task->node, dst = task->dst, siblings = 1;
-  trb_visit stack[TRBVH_MAX_DEPTH + 1], v;
-  v.depth = task->depth;
-  task->sah = 0;
-  task->max_depth = 0;
-  for (;;) {
-    for (; siblings; siblings--, child++, dst++) {
-      const trbvh_node node = b->nodes[child];
-      if (trb_is_leaf(node.count)) {
-        task->sah += trb_emit_leaf(b, node, dst, prim);
-        prim += trb_out(b, dst)->count;
-        task->max_depth = TRB_MAX(v.depth, task->max_depth);
-      } else {
-        task->sah += trb_emit_inner(b, node, dst, pair);
-        TRB_PREFETCH(&b->nodes[node.first]);
-        stack[waiting].first = node.first;
-        stack[waiting].pair = pair++;
-        stack[waiting++].depth = v.depth + 1;
-      }
-    }
-    if (waiting == 0) break;
-    v = stack[--waiting];
-    child = v.first;
-    dst = 2 * v.pair;
-    siblings = 2;
-  }
-  TRBVH_ASSERT(pair - task->pair == task->leaves - 1 && prim - task->first_prim == task->prims);
-}
-
-/* Second walk, above the tasks: writes, and tells them their places. The sum of equation 1 of what it wrote. */
-static double trb_emit_top(trb_build *b) {
-  uint32_t stack[TRBVH_MAX_DEPTH + 1], dsts[TRBVH_MAX_DEPTH + 1], waiting = 0, pair = 1, prim = 0, node = 0, dst = 0;
-  trb_task *task = b->tasks;
-  double sah = 0;
-  for (;;) {
-    const trbvh_node n = b->nodes[node];
-    if (trb_count(n.count) > TRB_BLOCK) {
-      sah += trb_emit_inner(b, n, dst, pair);
-      stack[waiting] = n.first + 1;
-      dsts[waiting++] = 2 * pair + 1;
-      node = n.first;
-      dst = 2 * pair++;
-    } else {
-      task->dst = dst;
-      task->pair = pair;
-      task->first_prim = prim;
-      pair += task->leaves - 1;
-      prim += task++->prims;
-      if (waiting == 0) return sah;
-      node = stack[--waiting];
-      dst = dsts[waiting];
-    }
-  }
+  const trb_build *b = (const trb_build *)context;
+  const trb_collapser c = trb_start_collapse(b);
+  trb_emit_task(&c, b->tasks[index]);
 }
 
 /* Memory for the result: the old block where it is large enough, else a new one. */
@@ -2224,61 +2469,45 @@ static trbvh_result trb_make_room(trb_build *b, trbvh *bvh, uint32_t leaves, uin
   b->tree.node_count = 2 * leaves;
   b->tree.ref_count = prims;
   b->stats.bytes_result = size;
-  return TRBVH_OK;
-}
-
-static trbvh_result trb_collapse(trb_build *b, trbvh *bvh) {
-  uint32_t leaves = 0, prims = 0, i;
-  trbvh_result result;
-  double sah, root;
-  trb_find_tasks(b);
-  if (trb_run(&b->runner, b->task_count, trb_count_job, b)) return TRBVH_CANCELLED;
-  for (i = 0; i < b->task_count; i++) {
-    leaves += b->tasks[i].leaves;
-    prims += b->tasks[i].prims;
-  }
-  result = trb_make_room(b, bvh, leaves, prims);
-  if (result) return result;
-  memset(trb_out(b, 1), 0, TRB_NODE_BYTES);
-  sah = trb_emit_top(b);
-  if (trb_run(&b->runner, b->task_count, trb_emit_job, b)) return TRBVH_CANCELLED;
-  for (i = 0; i < b->task_count; i++) {
-    sah += b->tasks[i].sah;
-    b->stats.max_depth = TRB_MAX(b->tasks[i].max_depth, b->stats.max_depth);
-  }
-  root = trb_sah_term(&b->nodes[0], 1);
-  b->stats.sah_cost = root > 0 ? sah / root : 0;
   b->stats.leaf_count = leaves;
   b->stats.node_count = b->tree.node_count;
   b->stats.ref_count = prims;
   return TRBVH_OK;
 }
 
-// >>finish ---- triangles in leaf order -----------------------------------------------------------------------------
+static trbvh_result trb_collapse(trb_build *b, trbvh *bvh) {
+  trb_collapser c = trb_start_collapse(b);
+  uint32_t leaves = 0, prims = 0, i;
+  trbvh_result result;
+  double sah, root;
+  b->task_count = trb_find_tasks(&c, b->tasks, &sah);
+  if (trb_run(&b->runner, b->task_count, trb_count_job, b)) return TRBVH_CANCELLED;
+  for (i = 0; i < b->task_count; i++) {
+    leaves += b->tasks[i].leaves;
+    prims += b->tasks[i].prims;
+    sah += b->tasks[i].sah;
+    b->stats.max_depth = TRB_MAX(b->tasks[i].max_depth, b->stats.max_depth);
+  }
+  root = trb_sah_term(b->nodes[0], 1);
+  b->stats.sah_cost = root > 0 ? sah / root : 0;
+  result = trb_make_room(b, bvh, leaves, prims);
+  if (result) return result;
+  c = trb_start_collapse(b);
+  memset(&c.out[1], 0, TRB_NODE_BYTES);
+  trb_emit_top(&c, b->tasks);
+  return trb_run(&b->runner, b->task_count, trb_emit_job, b) ? TRBVH_CANCELLED : TRBVH_OK;
+}
+
+// ---- Triangles ----
 static void trb_triangle_job(void *context, uint32_t index) {
   const trb_build *b = (const trb_build *)context;
-  const uint32_t *prims = b->tree.prims;
-  uint32_t i = index * TRB_BLOCK, end = TRB_MIN(b->tree.ref_count, i + TRB_BLOCK), vertex;
-  trbvh_triangle *out = (trbvh_triangle *)(uintptr_t)b->tree.triangles;
-  for (; i < end; i++) {
-    float v[3][3];
-    uint32_t inexact = 0;
-    int k;
-    if (i + 3 * TRB_AHEAD < end) {
-      trb_prefetch_indices(&b->input, prims[i + 3 * TRB_AHEAD]);
-      trb_prefetch_positions(&b->input, prims[i + TRB_AHEAD]);
-    }
-    trb_load_triangle(&b->input, prims[i], v, &vertex);
-    for (k = 0; k < 3; k++) {
-      out[i].v0[k] = v[0][k];
-      out[i].e1[k] = v[1][k] - v[0][k];
-      out[i].e2[k] = v[2][k] - v[0][k];
-      inexact |= (v[0][k] + out[i].e1[k] != v[1][k]) | (v[0][k] + out[i].e2[k] != v[2][k]);
-    }
-    out[i].prim = prims[i];
-    out[i].reserved0 = inexact;
-    out[i].reserved1 = 0;
-  }
+  const uint32_t first = index * TRB_BLOCK, end = TRB_MIN(b->tree.ref_count, first + TRB_BLOCK);
+  trb_make_triangles(&b->input, b->tree.prims, first, end, (trbvh_triangle *)(uintptr_t)b->tree.triangles);
+}
+
+static trbvh_result trb_finish(trb_build *b) {
+  uint32_t jobs = b->tree.triangles ? trb_blocks(b->tree.ref_count, TRB_BLOCK) : 0;
+  return trb_run(&b->runner, jobs, trb_triangle_job, b) ? TRBVH_CANCELLED : TRBVH_OK;
 }
 
 // >>build -----------------------------------------------------------------------------------------------------------
@@ -2290,21 +2519,6 @@ static trbvh_result trb_allocate_scratch(trb_build *b) {
   b->stats.bytes_scratch = b->scratch_size;
   trb_lay_out(b, trb_align(b->scratch));
   return TRBVH_OK;
-}
-
-static trbvh_result trb_restructure_rounds(trb_build *b, float share) {
-  int32_t round;
-  for (round = 0; round < b->options.treelet_rounds && round < 28; round++) {
-    uint32_t gamma = (uint32_t)TRB_TREELET << round;
-    if (gamma > b->ref_count) break;
-    if (trb_stage(&b->runner, share * (round ? 0.2f : 0.6f)) || trb_round(b, gamma)) return TRBVH_CANCELLED;
-  }
-  return TRBVH_OK;
-}
-
-static trbvh_result trb_finish(trb_build *b) {
-  uint32_t jobs = b->tree.triangles ? trb_blocks(b->tree.ref_count, TRB_BLOCK) : 0;
-  return trb_run(&b->runner, jobs, trb_triangle_job, b) ? TRBVH_CANCELLED : TRBVH_OK;
 }
 
 /* Runs one stage, whose share of the time is an estimate for the progress report, and adds up its milliseconds. */
@@ -2323,7 +2537,7 @@ static trbvh_result trb_run_stages(trb_build *b, trbvh *bvh) {
   if (b->split_max) { TRB_STAGE(split, ms_split, trb_split(b)) }
   if (!result) trb_close_gaps(b, b->refs);
   if (!result && b->ref_count == 0) return TRBVH_OK;
-  TRB_STAGE(rest * 0.05f, ms_morton, trb_make_keys(b))
+  TRB_STAGE(rest * 0.05f, ms_morton, trb_make_keys(b, 0) ? TRBVH_CANCELLED : TRBVH_OK)
   TRB_STAGE(rest * 0.20f, ms_sort, trb_sort_keys(b))
   TRB_STAGE(rest * 0.25f, ms_hierarchy, trb_build_hierarchy(b))
   TRB_STAGE(0, ms_treelets, trb_restructure_rounds(b, treelets))
@@ -2445,10 +2659,10 @@ TRBVH_API double trbvh_sah(const trbvh *bvh, float cost_node, float cost_prim) {
   double sum = 0, root;
   uint32_t i;
   if (!bvh || !bvh->node_count) return 0;
-  root = trb_sah_term(&bvh->nodes[0], 1);
+  root = trb_sah_term(bvh->nodes[0], 1);
   for (i = 0; i < bvh->node_count; i += i ? 1 : 2) {
     const trbvh_node *n = &bvh->nodes[i];
-    sum += trb_sah_term(n, n->count ? prim_weight * n->count : node_weight);
+    sum += trb_sah_term(*n, n->count ? prim_weight * n->count : node_weight);
   }
   return root > 0 ? sum / root : 0;
 }
@@ -2622,7 +2836,7 @@ TRBVH_API trbvh_result trbvh_validate(const trbvh *bvh, const trbvh_geometry *ge
 #endif /* !TRBVH_OPENCL_C */
 
 // >>end ---- the user's own code keeps its own floating-point rules and names ----------------------------------------
-#if defined(__clang__)
+#if defined(__clang__) && !defined(TRBVH_OPENCL_C)
   #pragma STDC FP_CONTRACT DEFAULT
 #elif defined(__GNUC__) && !defined(TRBVH_OPENCL_C)
   #pragma GCC pop_options

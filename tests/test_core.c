@@ -230,7 +230,7 @@ static void build_hierarchy(trb_build *b, const trbvh_geometry *g, const trbvh_o
   begin_build(b, g, o);
   CHECK(trb_read(b) == TRBVH_OK);
   trb_close_gaps(b, b->refs);
-  CHECK(trb_make_keys(b) == TRBVH_OK && trb_sort_keys(b) == TRBVH_OK && trb_build_hierarchy(b) == TRBVH_OK);
+  CHECK(!trb_make_keys(b, 0) && trb_sort_keys(b) == TRBVH_OK && trb_build_hierarchy(b) == TRBVH_OK);
 }
 
 static trbvh_geometry geometry_of_boxes(const trbvh_node *boxes, uint32_t count, float *memory) {
@@ -306,7 +306,7 @@ static void test_hierarchy(void) {
         g = geometry_of_boxes(boxes, counts[c], memory);
         build_hierarchy(&b, &g, NULL);
         for (i = 0; i < counts[c]; i++) {
-          x.code[i] = trb_morton(boxes[i], b.grid) >> (packed ? 63 - b.key_bits : 0);
+          x.code[i] = trb_morton(boxes[i], b.grid) >> (packed ? 63 - b.key_form.bits : 0);
           x.order[i] = i;
         }
         x.b = &b;
@@ -443,7 +443,7 @@ static void test_fragments(void) {
     b.grid.units_per_cell = 3 / 2097152.0f;
     trb_triangle_box((const float (*)[3])v, &box);
     box.first = 0;
-    count = trb_split_reference(&b, box, SPLITS, out);
+    count = trb_split_reference(&b.input, b.grid, box, SPLITS, out);
     CHECK(count >= 1 && count <= SPLITS + 1);
     if (round % 4 == 0) CHECK_MSG(count == SPLITS + 1, "%u fragments", count);
     for (i = 0; i < count; i++) {
