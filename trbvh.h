@@ -267,7 +267,9 @@ TRBVH_API trbvh_result trbvh_occluded_n (const trbvh *bvh, const trbvh_ray *rays
   #define TRB_SHARED static __attribute__((unused))
   #define TRB_GLOBAL __global
   typedef ulong trb_u64;
-  #ifndef TRB_WORK                       /* where a treelet's working memory lies */
+  #ifdef TRB_GPU                         /* where a treelet's working memory lies */
+    #define TRB_WORK __local
+  #else
     #define TRB_WORK
   #endif
   #ifdef TRB_CAN_PREFETCH                /* a CPU, compiled by clang */
@@ -461,7 +463,16 @@ TRB_CORE trb_u64 trb_morton(trbvh_node box, trb_grid grid) {
  * float, and the caller loops over TRB_LANES treelets, which every compiler turns into vector code of any width; in
  * OpenCL C it may be a vector itself. The table c goes out, for trb_partition to find the topology that made it. */
 #define TRB_TREELET 7
-#ifndef TRB_LANE
+#define TRB_GPU_LANES 32u
+#if defined(TRB_CPU)                     /* OpenCL C: a work-item takes so many treelets at a time ... */
+  #define TRB_LANE   float16
+  #define TRB_LANES  16u
+  #define TRB_VECTOR 16u
+#elif defined(TRB_GPU)                   /* ... or one, and a work-group of TRB_LANES work-items so many */
+  #define TRB_LANE   float
+  #define TRB_LANES  TRB_GPU_LANES
+  #define TRB_VECTOR 1u
+#else
   #define TRB_LANE   float
   #define TRB_LANES  8u                  /* treelets side by side in memory ... */
   #define TRB_VECTOR 1u                  /* ... of which one variable holds so many */
@@ -1573,7 +1584,7 @@ typedef struct trb_ray {
 
 /* Boxes are read as eight floats: min at 0, max at 4. 0 for a ray that can hit nothing: one with a NaN or infinity, or
  * without a direction. */
-TRB_CORE int trb_prepare_ray(trb_ray *r, const TRB_GLOBAL trbvh_ray *ray, const TRB_GLOBAL float *scene) {
+TRB_CORE int trb_prepare_ray(trb_ray *r, const trbvh_ray *ray, const TRB_GLOBAL float *scene) {
   float x = trb_abs(ray->dir[0]), y = trb_abs(ray->dir[1]), z = trb_abs(ray->dir[2]), extent = 0, dir[3];
   int k, finite = 1;
   r->t_unit = x + y + z < 8.6736174e-19f ? 1.1529215e18f : 1.0f;
@@ -1733,6 +1744,53 @@ TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbv
     } while (stack_near[height] > hit->t);
   }
 }
+
+// >>plan ---- a build on a device: what its host and its kernels both know (trbvh_cl.h) -------------------------------
+#define TRB_GPU_GROUP   256u             /* work-items of a group on a GPU ... */
+#define TRB_GPU_TILE    2048u            /* ... and elements in a row that it takes, where order matters */
+#define TRB_GPU_CHUNK   1024u            /* leaves over which one group builds the hierarchy ... */
+#define TRB_GPU_CHUNKS  16u              /* ... and so many chunks that the next one joins */
+#define TRB_GPU_LEVELS  128u             /* more than any tree has; they are listed one by one on a GPU */
+#define TRB_CANDIDATES  16u              /* scales tried at once */
+
+/* One lies in the device's memory while a build runs there. */
+typedef struct trb_plan {
+  trb_u64      position_offset, position_stride, index_offset;   /* bytes; boxes stand in positions' place */
+  trb_u64      scale;                    /* of the splits; scale_low is its number, or a lower bound */
+  trb_costs    costs;
+  trb_key_form form;
+  float        cost_node, cost_prim;
+  trbvh_u32    prim_count, position_count, index_size, boxes, split_max;
+  /* found out */
+  trb_grid     grid;
+  float        priority_unit;
+  float        sah, root_area;           /* equation 1's sum, with half areas, not yet divided by the root's */
+  trbvh_u32    scale_low, slots, ref_count;                      /* slots: references and gaps between them */
+  trbvh_u32    skipped, bad, bad_vertex; /* primitives; the first with an index out of range (TRBVH_NONE: none), and it */
+  trbvh_u32    groups, tasks, leaves, prims, max_depth;
+} trb_plan;
+
+/* What a work-group found among the primitives. */
+typedef struct trb_partial {
+  trbvh_node bounds;
+  trbvh_u32  skipped, bad, bad_vertex;
+  float      priority;
+} trb_partial;
+
+/* What a split has heard of its children while the hierarchy is built: 1 + the first leaf of the left one, 1 + the last
+ * leaf of the right one, or 0. */
+typedef struct trb_wait { trbvh_u32 first, last; } trb_wait;
+
+/* Nodes of one depth, in a list of all. */
+typedef struct trb_level { trbvh_u32 first, count; } trb_level;
+
+/* Of an inner node, by the number of its children's pair: inner nodes, primitives and equation 1 from it downwards; then
+ * the pair its children get in the result, and the next pair and primitive for what is below. */
+typedef struct trb_place {
+  trbvh_u32 inner, prims;
+  float     sah;
+  trbvh_u32 pair, next, prim;
+} trb_place;
 
 #ifndef TRBVH_OPENCL_C
 // ===================================================================================================================
@@ -2038,6 +2096,14 @@ typedef struct trb_build {
   uint32_t              digit_shift, gamma;
   trbvh                 tree;            /* the result, as it is made */
 } trb_build;
+
+/* What a backend offers; it keeps more behind this. Both report as trb_fail does; a build that fails leaves the tree's
+ * block as it is. */
+typedef struct trb_batch trb_batch;
+struct trbvh_device {
+  trbvh_result (*build)(trbvh_device *device, trb_build *b, trbvh *bvh);
+  trbvh_result (*trace)(trbvh_device *device, trb_build *b, const trb_batch *batch);
+};
 
 static trbvh_result trb_fail(trb_build *b, trbvh_result result, const char *format, unsigned a, unsigned c, unsigned d) {
   snprintf(b->stats.message, sizeof b->stats.message, format, a, c, d);
@@ -2547,32 +2613,61 @@ static trbvh_result trb_run_stages(trb_build *b, trbvh *bvh) {
   return result;
 }
 
+/* Was it the device that failed, so that the C code can do the work? */
+static int trb_falls_back(const trb_build *b, trbvh_result result) {
+  return !(b->options.flags & TRBVH_NO_FALLBACK) &&
+         (result == TRBVH_OUT_OF_DEVICE_MEMORY || result == TRBVH_NO_DEVICE || result == TRBVH_DEVICE_ERROR);
+}
+
+static trbvh_result trb_build_on_device(trb_build *b, trbvh *bvh) {
+  trbvh_device *device = b->options.device;
+  trbvh_result result;
+  trb_runner_start(&b->runner, &b->options, 0);
+  result = device->build(device, b, bvh);
+  trb_runner_stop(&b->runner);
+  b->stats.on_device = result == TRBVH_OK;
+  return result;
+}
+
+static trbvh_result trb_build_in_c(trb_build *b, trbvh *bvh) {
+  trbvh_result result;
+  trbvh_stats stats;                                 /* what a device did is forgotten, except why it stopped */
+  memset(&stats, 0, sizeof stats);
+  memcpy(stats.message, b->stats.message, sizeof stats.message);
+  b->stats = stats;
+  memset(&b->tree, 0, sizeof b->tree);
+  trb_runner_start(&b->runner, &b->options, b->input.count > TRB_BLOCK);
+  result = trb_run_stages(b, bvh);
+  trb_runner_stop(&b->runner);
+  trb_free(&b->options.allocator, b->scratch, b->scratch_size);
+  return result;
+}
+
+/* The tree, which stands in bvh's block, to the user. */
+static void trb_hand_over(const trb_build *b, trbvh *bvh, uint32_t prim_count) {
+  bvh->nodes = b->tree.nodes;
+  bvh->prims = b->tree.prims;
+  bvh->triangles = b->tree.triangles;
+  bvh->wide = NULL;
+  bvh->node_count = b->tree.node_count;
+  bvh->ref_count = b->tree.ref_count;
+  bvh->prim_count = prim_count;
+  bvh->flags = b->options.flags;
+}
+
 TRBVH_API trbvh_result trbvh_build(trbvh *bvh, const trbvh_geometry *geometry, const trbvh_options *options) {
   trb_build b;
   double start = trb_ms();
   trbvh_result result = trb_resolve(&b, geometry, options);
   if (!bvh) result = trb_fail(&b, TRBVH_INVALID_ARGUMENT, "bvh is NULL", 0, 0, 0);
-  if (!result && b.options.device) {
-    trb_fail(&b, TRBVH_OK, "this version has no device backend: built in scalar C", 0, 0, 0);
-    if (b.options.flags & TRBVH_NO_FALLBACK) result = TRBVH_NO_DEVICE;
-  }
   if (!result && b.input.count) {
-    trb_runner_start(&b.runner, &b.options, b.input.count > TRB_BLOCK);
-    result = trb_run_stages(&b, bvh);
-    trb_runner_stop(&b.runner);
-    trb_free(&b.options.allocator, b.scratch, b.scratch_size);
+    if (b.options.device) result = trb_build_on_device(&b, bvh);
+    if (!b.options.device || trb_falls_back(&b, result)) result = trb_build_in_c(&b, bvh);
   }
   if (result && bvh) {
     trbvh_free(bvh);
   } else if (bvh) {
-    bvh->nodes = b.tree.nodes;
-    bvh->prims = b.tree.prims;
-    bvh->triangles = b.tree.triangles;
-    bvh->wide = NULL;
-    bvh->node_count = b.tree.node_count;
-    bvh->ref_count = b.tree.ref_count;
-    bvh->prim_count = b.input.count;
-    bvh->flags = b.options.flags;
+    trb_hand_over(&b, bvh, b.input.count);
   }
   if (result && !b.stats.message[0]) trb_fail(&b, result, trbvh_result_text(result), 0, 0, 0);
   b.stats.ms_total = trb_ms() - start;
@@ -2601,13 +2696,13 @@ TRBVH_API int trbvh_occluded(const trbvh *bvh, const trbvh_ray *ray) {
 }
 
 #define TRB_RAY_BLOCK 1024u              /* rays a job traces */
-typedef struct trb_batch {
+struct trb_batch {
   const trbvh     *bvh;
   const trbvh_ray *rays;
   trbvh_hit       *hits;
   uint8_t         *occluded;
   size_t           count;
-} trb_batch;
+};
 
 static void trb_batch_job(void *context, uint32_t index) {
   const trb_batch *batch = (const trb_batch *)context;
@@ -2628,8 +2723,14 @@ static trbvh_result trb_run_batch(trb_batch batch, const trbvh_options *options)
     result = trb_fail(&b, TRBVH_INVALID_ARGUMENT, "the tree has no triangles", 0, 0, 0);
   if (!result && batch.count / TRB_RAY_BLOCK >= UINT32_MAX)
     result = trb_fail(&b, TRBVH_TOO_LARGE, "too many rays for one call", 0, 0, 0);
-  if (!result && batch.count) {
+  if (!result && batch.count && b.options.device) {
+    trb_runner_start(&b.runner, &b.options, 0);
+    result = b.options.device->trace(b.options.device, &b, &batch);
+    trb_runner_stop(&b.runner);
+  }
+  if (batch.count && (b.options.device ? trb_falls_back(&b, result) : !result)) {
     uint32_t jobs = (uint32_t)((batch.count + TRB_RAY_BLOCK - 1) / TRB_RAY_BLOCK);
+    result = TRBVH_OK;
     trb_runner_start(&b.runner, &b.options, jobs > 1);
     trb_stage(&b.runner, 1);
     if (trb_run(&b.runner, jobs, trb_batch_job, &batch) || trb_stage(&b.runner, 0)) result = TRBVH_CANCELLED;

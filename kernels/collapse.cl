@@ -1,0 +1,261 @@
+/* Collapse and layout (trbvh.h, >>collapse): first counts, of which the host reads the sums; then, with buffers of the
+ * right size, nodes and primitives. */
+#include "shape.cl"
+
+static trb_collapser trb_plan_collapser(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *spare,
+                                        __global uint *keys, __global uint *sorted) {
+  trb_collapser c;
+  c.nodes = nodes;
+  c.spare = spare;
+  c.words[0] = keys;
+  c.words[1] = sorted;
+  c.costs = plan->costs;
+  c.cost_node = plan->cost_node;
+  c.cost_prim = plan->cost_prim;
+  c.split = plan->split_max != 0;
+  c.out = 0;
+  c.prims = 0;
+  return c;
+}
+
+/* The same for the second walk. */
+static trb_collapser trb_plan_emitter(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *out,
+                                      __global uint *prims) {
+  trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0, 0);
+  c.out = out;
+  c.prims = prims;
+  return c;
+}
+
+static void trb_emit_padding(__global trbvh_node *out) {
+  uint k;
+  for (k = 0; k < 3; k++) out[1].min[k] = out[1].max[k] = 0;
+  out[1].first = out[1].count = 0;
+}
+
+#ifdef TRB_CPU
+TRB_KERNEL trb_k_find_tasks(__global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *spare,
+                            __global uint *keys, __global uint *sorted, __global trb_task *tasks) {
+  const trb_collapser c = trb_plan_collapser(plan, nodes, spare, keys, sorted);
+  float sah = 0;
+  plan->tasks = plan->ref_count ? trb_find_tasks(&c, tasks, &sah) : 0;
+  plan->sah = sah;
+  plan->root_area = trb_sah_term(nodes[0], 1);
+}
+
+TRB_KERNEL trb_k_count_tasks(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *spare,
+                             __global uint *keys, __global uint *sorted, __global trb_task *tasks) {
+  const trb_collapser c = trb_plan_collapser(plan, nodes, spare, keys, sorted);
+  uint i;
+  for (i = TRB_GROUP_ID; i < plan->tasks; i += (uint)get_num_groups(0)) trb_count_task(&c, &tasks[i]);
+}
+
+TRB_KERNEL trb_k_sum_tasks(__global trb_plan *plan, const __global trb_task *tasks) {
+  uint i, leaves = 0, prims = 0, max_depth = 0;
+  float sah = plan->sah;
+  for (i = 0; i < plan->tasks; i++) {
+    leaves += tasks[i].leaves;
+    prims += tasks[i].prims;
+    sah += tasks[i].sah;
+    max_depth = max(max_depth, tasks[i].max_depth);
+  }
+  plan->leaves = leaves;
+  plan->prims = prims;
+  plan->max_depth = max_depth;
+  plan->sah = sah;
+}
+
+TRB_KERNEL trb_k_emit_top(const __global trb_plan *plan, __global trbvh_node *nodes, __global trb_task *tasks,
+                          __global trbvh_node *out, __global uint *prims) {
+  const trb_collapser c = trb_plan_emitter(plan, nodes, out, prims);
+  trb_emit_padding(out);
+  trb_emit_top(&c, tasks);
+}
+
+TRB_KERNEL trb_k_emit_tasks(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_task *tasks,
+                            __global trbvh_node *out, __global uint *prims) {
+  const trb_collapser c = trb_plan_emitter(plan, nodes, out, prims);
+  uint i;
+  for (i = TRB_GROUP_ID; i < plan->tasks; i += (uint)get_num_groups(0)) trb_emit_task(&c, tasks[i]);
+}
+#else
+/* Inner nodes are listed level by level; their sums go from the bottom up, their places from the top down. */
+
+/* One work-group. first_refs: where each listed node's references begin. */
+TRB_KERNEL trb_k_first_inner(const __global trb_plan *plan, const __global trbvh_node *nodes, __global trb_level *levels,
+                             __global uint *list, __global uint *first_refs) {
+  uint i;
+  for (i = TRB_LOCAL_ID; i < TRB_GPU_LEVELS; i += TRB_GROUP) levels[i].first = levels[i].count = 0;
+  TRB_SYNC();
+  if (TRB_LOCAL_ID != 0 || plan->ref_count == 0) return;
+  list[0] = first_refs[0] = 0;
+  levels[0].count = !trb_is_leaf(nodes[0].count);
+}
+
+static void trb_list_inner(const trb_collapser *c, __global trb_level *levels, __global uint *list, __global uint *first_refs,
+                           uint level, uint item, uint items, __local uint *space) {
+  const uint first = levels[level].first, count = levels[level].count, next = first + count;
+  uint i;
+  for (i = item; i - TRB_LOCAL_ID < count; i += items) {
+    uint found = 0, child[2] = {0, 0}, refs[2] = {0, 0}, side, at;
+    if (i < count) {
+      const uint first_ref = first_refs[first + i], pair = trb_bounded_node(c, list[first + i], level, first_ref).first;
+      const uint left = trb_count(c->nodes[pair].count);
+      for (side = 0; side < 2; side++)
+        if (!trb_is_leaf(c->nodes[pair + side].count)) {
+          child[found] = pair + side;
+          refs[found++] = first_ref + (side ? left : 0);
+        }
+    }
+    at = next + trb_reserve(&levels[level + 1].count, found, space);
+    for (side = 0; side < found; side++) {
+      list[at + side] = child[side];
+      first_refs[at + side] = refs[side];
+    }
+  }
+  if (item == 0) levels[level + 1].first = next;
+}
+
+TRB_KERNEL trb_k_list_inner(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *spare,
+                            __global uint *keys, __global uint *sorted, __global trb_level *levels, __global uint *list,
+                            __global uint *first_refs, uint level) {
+  __local uint space[2];
+  const trb_collapser c = trb_plan_collapser(plan, nodes, spare, keys, sorted);
+  trb_list_inner(&c, levels, list, first_refs, level, (uint)get_global_id(0), (uint)get_global_size(0), space);
+}
+
+/* One work-group: all levels from this one on. */
+TRB_KERNEL trb_k_list_rest(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *spare,
+                           __global uint *keys, __global uint *sorted, __global trb_level *levels, __global uint *list,
+                           __global uint *first_refs, uint level) {
+  __local uint space[2];
+  const trb_collapser c = trb_plan_collapser(plan, nodes, spare, keys, sorted);
+  for (; level + 1 < TRB_GPU_LEVELS && levels[level].count; level++) {
+    trb_list_inner(&c, levels, list, first_refs, level, TRB_LOCAL_ID, TRB_GROUP, space);
+    TRB_SYNC();
+  }
+}
+
+static void trb_count_inner(const trb_collapser *c, __global trb_place *places, uint index) {
+  const trbvh_node node = c->nodes[index];
+  trb_place sum;
+  uint side;
+  sum.inner = 1;
+  sum.prims = sum.pair = sum.next = sum.prim = 0;
+  sum.sah = trb_sah_term(node, c->cost_node);
+  for (side = 0; side < 2; side++) {
+    const trbvh_node child = c->nodes[node.first + side];
+    if (trb_is_leaf(child.count)) {
+      const uint count = trb_count_prims(c, child);
+      sum.prims += count;
+      sum.sah += trb_sah_term(child, c->cost_prim * count);
+    } else {
+      const trb_place below = places[child.first / 2];
+      sum.inner += below.inner;
+      sum.prims += below.prims;
+      sum.sah += below.sah;
+    }
+  }
+  places[node.first / 2] = sum;
+}
+
+TRB_KERNEL trb_k_count_inner(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,
+                             const __global uint *list, __global trb_place *places, uint level) {
+  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0, 0);
+  const uint first = levels[level].first, count = levels[level].count;
+  uint i;
+  TRB_FOR(i, count) trb_count_inner(&c, places, list[first + i]);
+}
+
+/* One work-group: all levels from the lowest one up to this. */
+TRB_KERNEL trb_k_count_rest(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,
+                            const __global uint *list, __global trb_place *places, uint level) {
+  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0, 0);
+  uint lowest = level, i;
+  while (lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;
+  for (lowest++; lowest-- > level;) {
+    for (i = TRB_LOCAL_ID; i < levels[lowest].count; i += TRB_GROUP)
+      trb_count_inner(&c, places, list[levels[lowest].first + i]);
+    TRB_SYNC();
+  }
+}
+
+/* One work-item is enough. */
+TRB_KERNEL trb_k_sum_inner(__global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,
+                           __global trb_place *places) {
+  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0, 0);
+  uint depth = 0;
+  if (TRB_LOCAL_ID != 0) return;
+  plan->leaves = plan->prims = plan->max_depth = 0;
+  if (plan->ref_count == 0) return;
+  plan->root_area = trb_sah_term(nodes[0], 1);
+  if (trb_is_leaf(nodes[0].count)) {
+    plan->leaves = 1;
+    plan->prims = trb_count_prims(&c, nodes[0]);
+    plan->sah = trb_sah_term(nodes[0], c.cost_prim * plan->prims);
+  } else {
+    __global trb_place *root = &places[nodes[0].first / 2];
+    while (levels[depth].count) depth++;
+    plan->leaves = root->inner + 1;
+    plan->prims = root->prims;
+    plan->sah = root->sah;
+    plan->max_depth = depth;
+    root->pair = 1;
+    root->next = 2;
+    root->prim = 0;
+  }
+}
+
+/* Where an inner node's children go, and what is below them: the order of trb_emit_top and trb_emit_task. */
+static void trb_place_children(const trb_collapser *c, __global trb_place *places, uint index) {
+  const trbvh_node node = c->nodes[index];
+  const trb_place place = places[node.first / 2];
+  const int top = trb_count(node.count) > TRB_BLOCK;
+  trbvh_node child[2];
+  uint next = place.next, p = place.prim, side;
+  trb_place below[2];
+  for (side = 0; side < 2; side++) {                 /* the children themselves: left before right */
+    child[side] = c->nodes[node.first + side];
+    if (trb_is_leaf(child[side].count)) {
+      p += trb_emit_leaf(c, child[side], 2 * place.pair + side, p);
+    } else {
+      below[side] = places[child[side].first / 2];
+      below[side].pair = next++;
+      trb_emit_inner(c, child[side], 2 * place.pair + side, below[side].pair);
+      if (top) {                                     /* above the tasks, each with all that is below it */
+        below[side].next = next;
+        below[side].prim = p;
+        next += below[side].inner - 1;
+        p += below[side].prims;
+      }
+    }
+  }
+  for (side = 2; side-- > 0 && !top;)                /* within a task, what is below: right before left */
+    if (!trb_is_leaf(child[side].count)) {
+      below[side].next = next;
+      below[side].prim = p;
+      next += below[side].inner - 1;
+      p += below[side].prims;
+    }
+  for (side = 0; side < 2; side++)
+    if (!trb_is_leaf(child[side].count)) places[child[side].first / 2] = below[side];
+}
+
+TRB_KERNEL trb_k_emit_root(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *out,
+                           __global uint *prims) {
+  const trb_collapser c = trb_plan_emitter(plan, nodes, out, prims);
+  if (TRB_LOCAL_ID != 0) return;
+  trb_emit_padding(out);
+  if (trb_is_leaf(nodes[0].count)) trb_emit_leaf(&c, nodes[0], 0, 0);
+  else trb_emit_inner(&c, nodes[0], 0, 1);
+}
+
+TRB_KERNEL trb_k_emit_level(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,
+                            const __global uint *list, __global trb_place *places, __global trbvh_node *out,
+                            __global uint *prims, uint level) {
+  const trb_collapser c = trb_plan_emitter(plan, nodes, out, prims);
+  const uint first = levels[level].first, count = levels[level].count;
+  uint i;
+  TRB_FOR(i, count) trb_place_children(&c, places, list[first + i]);
+}
+#endif

@@ -1,0 +1,84 @@
+/* What all kernels share: their two shapes, and the few things that work-items do together.
+ *
+ * On a CPU (TRB_CPU), a work-group is one work-item, which takes TRB_BLOCK elements in a row: a loop over memory that
+ * the caches like, and no barriers. On a GPU it is TRB_GROUP work-items side by side. Most kernels read the same for
+ * both; those that cannot have two versions. Nothing here needs more than OpenCL C 1.2: work-groups never wait for
+ * each other, and what one kernel writes is read by the next one. */
+#include "trbvh.h"
+
+#ifdef TRB_CPU
+  #define TRB_GROUP 1u
+  #define TRB_TILE  TRB_BLOCK                        /* elements in a row that a work-group takes, where order matters */
+  #define TRB_SYNC() ((void)0)
+#else                                                /* TRB_GPU */
+  #define TRB_GROUP TRB_GPU_GROUP
+  #define TRB_TILE  TRB_GPU_TILE
+  #define TRB_SYNC() barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE)
+#endif
+#define TRB_KERNEL    __kernel __attribute__((reqd_work_group_size(TRB_GROUP, 1, 1))) void
+#define TRB_GROUP_ID  ((uint)get_group_id(0))
+#define TRB_LOCAL_ID  ((uint)get_local_id(0))
+
+/* for (i = ...) over all elements below n that are this work-item's, in any order. */
+#ifdef TRB_CPU
+  #define TRB_FOR(i, n) for (i = TRB_GROUP_ID * TRB_BLOCK; i < (n) && i < (TRB_GROUP_ID + 1) * TRB_BLOCK; i++)
+#else
+  #define TRB_FOR(i, n) for (i = (uint)get_global_id(0); i < (n); i += (uint)get_global_size(0))
+#endif
+/* Sum over the work-items before this one; total: over all. All of the group call it. */
+static uint trb_scan(uint value, __local uint *space, uint *total) {
+#ifdef TRB_CPU
+  *total = value;
+  return 0;
+#else
+  const uint id = TRB_LOCAL_ID;
+  uint sum = value, step;
+  TRB_SYNC();
+  space[id] = value;
+  for (step = 1; step < TRB_GROUP; step *= 2) {
+    uint before;
+    TRB_SYNC();
+    before = id >= step ? space[id - step] : 0;
+    TRB_SYNC();
+    sum += before;
+    space[id] = sum;
+  }
+  TRB_SYNC();
+  *total = space[TRB_GROUP - 1];
+  return sum - value;
+#endif
+}
+
+/* The mesh that a plan tells of. */
+static trb_mesh trb_plan_mesh(const __global trb_plan *plan, const __global char *positions, const __global char *indices) {
+  trb_mesh mesh;
+  mesh.positions = plan->boxes ? 0 : positions + plan->position_offset;
+  mesh.boxes = plan->boxes ? positions + plan->position_offset : 0;
+  mesh.indices = plan->index_size ? indices + plan->index_offset : 0;
+  mesh.position_stride = mesh.box_stride = plan->position_stride;
+  mesh.position_count = plan->position_count;
+  mesh.index_size = plan->index_size;
+  mesh.count = plan->prim_count;
+  return mesh;
+}
+
+/* ---- Lists of nodes by level: the root's is 0 ----
+ * They are how a tree is worked on without waiting: every kernel takes one level, whose nodes are independent. The
+ * lists stand one after the other; their order within a level is chance, and nothing depends on it. Below the wide
+ * levels, which get a launch each, trees are narrow: one work-group takes all that are left. */
+/* Makes room for `count` more at *end; returns where. All of the group call it; space: two words. */
+static uint trb_reserve(volatile __global uint *end, uint count, __local uint *space) {
+#ifdef TRB_CPU
+  return count ? atomic_add(end, count) : 0;
+#else
+  uint at;
+  TRB_SYNC();
+  if (TRB_LOCAL_ID == 0) space[0] = 0;
+  TRB_SYNC();
+  at = count ? atomic_add((volatile __local uint *)&space[0], count) : 0;
+  TRB_SYNC();
+  if (TRB_LOCAL_ID == 0) space[1] = atomic_add(end, space[0]);
+  TRB_SYNC();
+  return at + space[1];
+#endif
+}

@@ -1,0 +1,98 @@
+/* Treelet restructuring (trbvh.h, >>treelets): one round, in which every node of gamma references or more is the root of
+ * a treelet once, after those below it. */
+#include "shape.cl"
+
+#ifdef TRB_CPU
+TRB_KERNEL trb_k_find_groups(__global trb_plan *plan, const __global trbvh_node *nodes, __global uint *top,
+                             __global uint *lists, __global trb_group *groups, uint gamma) {
+  plan->groups = plan->ref_count ? trb_find_groups(nodes, top, lists, groups, gamma) : 0;
+}
+
+TRB_KERNEL trb_k_restructure(const __global trb_plan *plan, __global trbvh_node *nodes, __global uint *lists,
+                             const __global trb_group *groups, uint gamma) {
+  if (TRB_GROUP_ID < plan->groups) trb_restructure_group(nodes, lists, groups[TRB_GROUP_ID], gamma, plan->costs);
+}
+
+TRB_KERNEL trb_k_restructure_top(const __global trb_plan *plan, __global trbvh_node *nodes, __global uint *lists, uint gamma) {
+  if (plan->ref_count) trb_restructure_top(nodes, lists, plan->ref_count, gamma, plan->costs);
+}
+#else
+/* Nodes of one depth are independent: the roots are listed level by level from the top down, and restructured from the
+ * bottom up. One work-item. */
+TRB_KERNEL trb_k_first_level(const __global trb_plan *plan, const __global trbvh_node *nodes, __global trb_level *levels,
+                             __global uint *list, uint gamma) {
+  uint i;
+  for (i = TRB_LOCAL_ID; i < TRB_GPU_LEVELS; i += TRB_GROUP) levels[i].first = levels[i].count = 0;
+  TRB_SYNC();
+  if (TRB_LOCAL_ID != 0 || plan->ref_count == 0) return;
+  list[0] = 0;
+  levels[0].count = trb_count(nodes[0].count) >= gamma;
+}
+
+static void trb_list_level(const __global trbvh_node *nodes, __global trb_level *levels, __global uint *list, uint level,
+                           uint gamma, uint item, uint items, __local uint *space) {
+  const uint first = levels[level].first, count = levels[level].count, next = first + count;
+  uint i;
+  for (i = item; i - TRB_LOCAL_ID < count; i += items) {
+    uint found = 0, child[2] = {0, 0}, side, at;
+    if (i < count) {
+      const uint pair = nodes[list[first + i]].first;
+      for (side = 0; side < 2; side++)
+        if (trb_count(nodes[pair + side].count) >= gamma) child[found++] = pair + side;
+    }
+    at = next + trb_reserve(&levels[level + 1].count, found, space);
+    for (side = 0; side < found; side++) list[at + side] = child[side];
+  }
+  if (item == 0) levels[level + 1].first = next;
+}
+
+TRB_KERNEL trb_k_list_level(const __global trbvh_node *nodes, __global trb_level *levels, __global uint *list, uint gamma,
+                            uint level) {
+  __local uint space[2];
+  trb_list_level(nodes, levels, list, level, gamma, (uint)get_global_id(0), (uint)get_global_size(0), space);
+}
+
+/* One work-group: all levels from this one on. */
+TRB_KERNEL trb_k_list_levels(const __global trbvh_node *nodes, __global trb_level *levels, __global uint *list, uint gamma,
+                             uint level) {
+  __local uint space[2];
+  for (; level + 1 < TRB_GPU_LEVELS && levels[level].count; level++) {
+    trb_list_level(nodes, levels, list, level, gamma, TRB_LOCAL_ID, TRB_GROUP, space);
+    TRB_SYNC();
+  }
+}
+
+#define TRB_TREELET_KERNEL __kernel __attribute__((reqd_work_group_size(TRB_LANES, 1, 1))) void
+
+static void trb_restructure_lane(__global trbvh_node *nodes, __local trb_treelets *t, uint root, trb_costs costs) {
+  const uint lane = TRB_LOCAL_ID;
+  uint i;
+  trb_expand(nodes, t, lane, 0, 0, root);
+  for (i = 1; i < TRB_TREELET - 1; i++) trb_expand_largest(nodes, t, lane, i);
+  for (i = 0; i < TRB_TREELET; i++) trb_enter_leaf(nodes, t, lane, i);
+  trb_treelet_costs(t->leaves + lane, t->table + lane, costs);
+  trb_finish_treelet(nodes, t, lane, root, costs);
+}
+
+/* The level's roots from number `begin` on. */
+TRB_TREELET_KERNEL trb_k_restructure_level(const __global trb_plan *plan, __global trbvh_node *nodes,
+                                           const __global trb_level *levels, const __global uint *list, uint level,
+                                           uint begin) {
+  __local trb_treelets t;
+  const uint i = begin + (uint)get_global_id(0);
+  if (i < levels[level].count) trb_restructure_lane(nodes, &t, list[levels[level].first + i], plan->costs);
+}
+
+/* One work-group: all levels from the lowest one up to this. */
+TRB_TREELET_KERNEL trb_k_restructure_levels(const __global trb_plan *plan, __global trbvh_node *nodes,
+                                            const __global trb_level *levels, const __global uint *list, uint level) {
+  __local trb_treelets t;
+  uint lowest = level, i;
+  while (lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;
+  for (lowest++; lowest-- > level;) {
+    for (i = TRB_LOCAL_ID; i < levels[lowest].count; i += TRB_LANES)
+      trb_restructure_lane(nodes, &t, list[levels[lowest].first + i], plan->costs);
+    TRB_SYNC();
+  }
+}
+#endif

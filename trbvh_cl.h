@@ -1,0 +1,4020 @@
+/* trbvh_cl.h - trbvh.h on OpenCL devices: the same pipeline, chosen at run time, the same tree bit for bit
+ * MIT or public domain, your choice: see the end of trbvh.h.
+ *
+ * Do this in ONE C or C++ file; it includes trbvh.h, whose implementation must be in the same file:
+ *
+ *     #define TRBVH_IMPLEMENTATION
+ *     #include "trbvh_cl.h"
+ *
+ * USAGE: three lines more than with trbvh.h alone
+ *     trbvh_options options = {0};
+ *     options.device = trbvh_cl_open(NULL, NULL);     // NULL where there is no OpenCL: trbvh_build then runs in C
+ *     trbvh_result result = trbvh_build(&bvh, &mesh, &options);
+ *     trbvh_cl_close(options.device);
+ *
+ *   Everything else stays as it is: bvh is the same tree in host memory, and trbvh_intersect_n and trbvh_occluded_n run
+ *   on options.device too. stats.on_device tells which code made the tree, stats.message why it was not the device's.
+ *   For geometry and trees that stay in device memory there are the functions below that begin with trbvh_cl.
+ *
+ * WHAT IT NEEDS
+ *   To compile: nothing, neither OpenCL's headers nor its library. (With an old glibc: -ldl.)
+ *   To run: an OpenCL 1.2 device. libOpenCL is opened by name; one that the process has loaded already is used first.
+ *   Without it, or without a device, trbvh_cl_open returns NULL and says why.
+ *   Kernels are compiled when they are first needed, once a device; that takes a second or two. Keep the device open,
+ *   and keep what was compiled between runs: trbvh_cl_desc.cache_load and cache_save.
+ *
+ * WHAT IS PROMISED
+ *   The tree of trbvh_build is that of the C code bit for bit, on any device whose float arithmetic is IEEE's.
+ *   When a device fails midway (memory, compiler, launch, device lost), the C code makes the tree, and stats.message
+ *   says what happened; with TRBVH_NO_FALLBACK it is an error. So is a mesh too small to be worth a launch (below
+ *   TRB_CL_SMALL triangles): built in C, unless TRBVH_NO_FALLBACK is set.
+ *   Rays on a device test triangles in float, the C code in double: hits may differ in the last bits, and at edges.
+ *
+ * THREADS
+ *   One device must not be used from two threads at once. After fork(), a child must not use a device of its parent.
+ *
+ * COMPILE-TIME MACROS, to be defined before the implementation is included
+ *   TRBVH_NO_OPENCL   leave the backend out: trbvh_cl_open always returns NULL. For consoles, WebAssembly, static glibc
+ */
+#ifndef TRBVH_CL_H
+#define TRBVH_CL_H
+#include "trbvh.h"
+
+/* The tags behind cl_command_queue, cl_mem, cl_event: the real types fit, whether CL/cl.h is included before, after or
+ * never. */
+struct _cl_command_queue;
+struct _cl_mem;
+struct _cl_event;
+
+// >>devices ---------------------------------------------------------------------------------------------------------
+typedef struct trbvh_cl_desc {
+  struct _cl_command_queue *queue;   /* yours (its context and device are used), or NULL to open one. In order; an out-of-order one is an error */
+  const char *name;                  /* part of a device or platform name; NULL = the environment's TRBVH_CL_DEVICE, else the first GPU, else the first CPU */
+  /* optional cache for compiled programs; key is a file-name-safe text of less than 128 characters. load returns the size (0 = not there) and fills out when capacity is enough; what is damaged or outdated is not used */
+  size_t (*cache_load)(void *user, const char *key, void *out, size_t capacity);
+  void   (*cache_save)(void *user, const char *key, const void *bytes, size_t size);
+  void   *user;
+} trbvh_cl_desc;
+typedef struct trbvh_cl_info {
+  char     name[128], platform[128], version[128];   /* version: of the driver */
+  int      is_gpu;
+  uint64_t memory_bytes;
+  uint32_t compute_units;
+} trbvh_cl_info;
+TRBVH_API uint32_t      trbvh_cl_devices(trbvh_cl_info *out, uint32_t capacity);           /* how many there are; 0 where OpenCL is absent */
+TRBVH_API trbvh_device *trbvh_cl_open   (const trbvh_cl_desc *desc, trbvh_stats *stats);   /* NULL = none (stats->message says why): passing NULL on builds in scalar C. Both may be NULL */
+TRBVH_API void          trbvh_cl_close  (trbvh_device *device);                            /* waits for it; NULL is fine. Trees of it are freed before */
+TRBVH_API const char   *trbvh_cl_name   (const trbvh_device *device);                      /* never NULL */
+
+// >>resident ---- buffers in, tree out, nothing copied to the host ---------------------------------------------------
+/* A mesh in device memory, as trbvh_geometry's. Offsets, strides in bytes: multiples of 4, of index_size for indices.
+ * position_count is needed with indices, else 0 = 3 * count. */
+typedef struct trbvh_cl_geometry {
+  struct _cl_mem *positions, *indices;               /* indices NULL: triangle soup */
+  size_t   position_offset, position_stride, index_offset;
+  uint32_t position_count, index_size, count;
+} trbvh_cl_geometry;
+/* A tree in device memory: nodes, prims and triangles as in trbvh. {0} is an empty one. */
+typedef struct trbvh_cl_tree {
+  struct _cl_mem *nodes, *prims, *triangles;         /* triangles NULL with TRBVH_NO_TRIANGLES */
+  uint32_t node_count, ref_count, prim_count;
+} trbvh_cl_tree;
+
+/* All enqueue their work on the device's queue and return; done, where not NULL, gets an event that is complete when the
+ * result is there, and is yours to release. On failure tree is {0} and done NULL, and options->stats tells why.
+ * Options: flags, quality and its settings, progress, stats. Whatever fails, there is no scalar build behind these.
+ *
+ * build waits once, for some 200 bytes of counts, to make the result's buffers in the right size; tree is {0}, or a
+ * tree of the same device, whose buffers are freed.
+ * refit: the mesh has moved, its topology has not. Boxes of a tree without splits become what build makes them; in one
+ * with splits a leaf gets its whole triangles' boxes. The indices are not checked again. */
+TRBVH_API trbvh_result trbvh_cl_build    (trbvh_device *device, trbvh_cl_tree *tree, const trbvh_cl_geometry *geometry, const trbvh_options *options, struct _cl_event **done);
+TRBVH_API trbvh_result trbvh_cl_refit    (trbvh_device *device, trbvh_cl_tree *tree, const trbvh_cl_geometry *geometry, struct _cl_event **done);
+TRBVH_API trbvh_result trbvh_cl_intersect(trbvh_device *device, const trbvh_cl_tree *tree, struct _cl_mem *rays, struct _cl_mem *hits, size_t count, struct _cl_event **done);        /* trbvh_ray[], trbvh_hit[] */
+TRBVH_API trbvh_result trbvh_cl_occluded (trbvh_device *device, const trbvh_cl_tree *tree, struct _cl_mem *rays, struct _cl_mem *occluded, size_t count, struct _cl_event **done);    /* one byte a ray: 1 = occluded */
+TRBVH_API trbvh_result trbvh_cl_upload   (trbvh_device *device, trbvh_cl_tree *tree, const trbvh *bvh);                                         /* waits */
+TRBVH_API trbvh_result trbvh_cl_download (trbvh_device *device, const trbvh_cl_tree *tree, trbvh *bvh, const trbvh_options *options);           /* waits; of options, allocator and stats */
+TRBVH_API void         trbvh_cl_free     (trbvh_device *device, trbvh_cl_tree *tree);                                                           /* {0} is fine, twice is fine */
+/* Types and traversal in OpenCL C, to put before kernels of your own: clCreateProgramWithSource(context, lines, source,
+ * NULL, &error) and one more. It has trbvh_node, trbvh_triangle, trbvh_ray, trbvh_hit as above, trbvh_intersect and
+ * trbvh_occluded (kernels/query.cl). */
+TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines);
+#endif /* TRBVH_CL_H */
+
+// ===================================================================================================================
+//   IMPLEMENTATION
+// ===================================================================================================================
+#if defined(TRBVH_IMPLEMENTATION) && !defined(TRBVH_CL_IMPLEMENTED)
+#define TRBVH_CL_IMPLEMENTED
+#if defined(__EMSCRIPTEN__) && !defined(TRBVH_NO_OPENCL)
+  #define TRBVH_NO_OPENCL
+#endif
+
+// >>kernels begin ---- made by kernels/embed.c from trbvh.h and kernels/*.cl: do not edit ---------------------------
+static const char *const trb_cl_text[] = {
+  "#line 73 \"trbvh.h\"\n",
+  "#define TRBVH_VERSION_MAJOR 0\n",
+  "#define TRBVH_VERSION_MINOR 1\n",
+  "#define TRBVH_VERSION_PATCH 0\n",
+  "#define TRBVH_VERSION (TRBVH_VERSION_MAJOR * 10000 + TRBVH_VERSION_MINOR * 100 + TRBVH_VERSION_PATCH)\n",
+  "\n",
+  "\n",
+  "\n",
+  "  #define TRBVH_OPENCL_C 1\n",
+  "  typedef uint trbvh_u32;\n",
+  "#line 87 \"trbvh.h\"\n",
+  "#define TRBVH_NONE      0xFFFFFFFFu\n",
+  "#define TRBVH_MAX_DEPTH 64\n",
+  "\n",
+  "\n",
+  "\n",
+  "typedef struct trbvh_node {\n",
+  "  float min[3]; trbvh_u32 first;\n",
+  "  float max[3]; trbvh_u32 count;\n",
+  "} trbvh_node;\n",
+  "\n",
+  "\n",
+  "\n",
+  "typedef struct trbvh_triangle {\n",
+  "  float v0[3]; trbvh_u32 prim;\n",
+  "  float e1[3]; trbvh_u32 reserved0;\n",
+  "  float e2[3]; trbvh_u32 reserved1;\n",
+  "} trbvh_triangle;\n",
+  "\n",
+  "\n",
+  "\n",
+  "typedef struct trbvh_ray { float origin[3]; float tmin; float dir[3]; float tmax; } trbvh_ray;\n",
+  "\n",
+  "\n",
+  "\n",
+  "typedef struct trbvh_hit { float t, u, v; trbvh_u32 prim; trbvh_u32 instance; } trbvh_hit;\n",
+  "#line 255 \"trbvh.h\"\n",
+  "  #pragma OPENCL FP_CONTRACT OFF\n",
+  "#line 266 \"trbvh.h\"\n",
+  "  #define TRB_CORE   static inline __attribute__((unused))\n",
+  "  #define TRB_SHARED static __attribute__((unused))\n",
+  "  #define TRB_GLOBAL __global\n",
+  "  typedef ulong trb_u64;\n",
+  "  #ifdef TRB_GPU\n",
+  "    #define TRB_WORK __local\n",
+  "  #else\n",
+  "    #define TRB_WORK\n",
+  "  #endif\n",
+  "  #ifdef TRB_CAN_PREFETCH\n",
+  "    #define TRB_PREFETCH(address) __builtin_prefetch((const void *)(size_t)(address))\n",
+  "  #endif\n",
+  "  #define trb_bits(x)  as_uint(x)\n",
+  "  #define trb_float(x) as_float(x)\n",
+  "#line 302 \"trbvh.h\"\n",
+  "#ifndef TRB_PREFETCH\n",
+  "  #define TRB_PREFETCH(address) ((void)(address))\n",
+  "#endif\n",
+  "#ifndef TRBVH_ASSERT\n",
+  "  #define TRBVH_ASSERT(x) ((void)0)\n",
+  "#endif\n",
+  "#ifndef TRB_REAL\n",
+  "\n",
+  "    #define TRB_REAL float\n",
+  "    #define TRB_NOISE 9.5367432e-7f\n",
+  "#line 316 \"trbvh.h\"\n",
+  "#endif\n",
+  "\n",
+  "  #define TRB_ALIGNED(type) type __attribute__((aligned(64)))\n",
+  "\n",
+  "\n",
+  "\n",
+  "#if defined(__cplusplus) || defined(_MSC_VER)\n",
+  "  #define TRB_RESTRICT __restrict\n",
+  "#else\n",
+  "  #define TRB_RESTRICT restrict\n",
+  "#endif\n",
+  "#line 337 \"trbvh.h\"\n",
+  "#define TRB_MIN(a, b) ((a) < (b) ? (a) : (b))\n",
+  "#define TRB_MAX(a, b) ((a) > (b) ? (a) : (b))\n",
+  "\n",
+  "TRB_CORE float trb_abs(float x) { return x < 0 ? -x : x; }\n",
+  "TRB_CORE int   trb_finite(float x) { return (trb_bits(x) & 0x7F800000u) != 0x7F800000u; }\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_log2(trbvh_u32 x) {\n",
+  "  trbvh_u32 n = 0;\n",
+  "  if (x >> 16) { n += 16; x >>= 16; }\n",
+  "  if (x >> 8)  { n += 8;  x >>= 8; }\n",
+  "  if (x >> 4)  { n += 4;  x >>= 4; }\n",
+  "  if (x >> 2)  { n += 2;  x >>= 2; }\n",
+  "  return n + (x >> 1);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE float trb_reciprocal(float x) {\n",
+  "  float r = trb_float(0x7EF311C3u - trb_bits(x));\n",
+  "  r = r * (2.0f - x * r);\n",
+  "  r = r * (2.0f - x * r);\n",
+  "  r = r * (2.0f - x * r);\n",
+  "  return r;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE float trb_cube_root(float x) {\n",
+  "  float r;\n",
+  "  int i;\n",
+  "  if (!(x > 1e-30f)) return 0;\n",
+  "  r = trb_float(0x54A21D2Au - trb_bits(x) / 3);\n",
+  "  for (i = 0; i < 4; i++) r = r * (4.0f - x * r * r * r) * 0.333333343f;\n",
+  "  return x * r * r;\n",
+  "}\n",
+  "#line 380 \"trbvh.h\"\n",
+  "#define TRB_MAX_LEAF 16u\n",
+  "#define TRB_SMALL    0x80000000u\n",
+  "#define TRB_LEAF     0x40000000u\n",
+  "\n",
+  "\n",
+  "typedef struct trb_costs { float ratio; trbvh_u32 max_leaf; } trb_costs;\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_count(trbvh_u32 word)   { return word & TRB_SMALL ? ((word >> 26) & 15u) + 1 : word; }\n",
+  "TRB_CORE float     trb_cost(trbvh_u32 word)    { return word & TRB_SMALL ? trb_float((word & 0x3FFFFFFu) << 5) : 0; }\n",
+  "TRB_CORE int       trb_is_leaf(trbvh_u32 word) { return (word & (TRB_SMALL | TRB_LEAF)) == (TRB_SMALL | TRB_LEAF); }\n",
+  "\n",
+  "\n",
+  "TRB_CORE float trb_area(trbvh_node n) {\n",
+  "  float x = n.max[0] - n.min[0], y = n.max[1] - n.min[1], z = n.max[2] - n.min[2];\n",
+  "  float area = x * y + z * (x + y);\n",
+  "  return TRB_MIN(area, FLT_MAX);\n",
+  "}\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_small(trbvh_u32 count, float cost, int leaf) {\n",
+  "  return TRB_SMALL | (leaf ? TRB_LEAF : 0) | (count - 1) << 26 | (trb_bits(cost) & 0x7FFFFFFFu) >> 5;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE trbvh_node trb_reference(trbvh_node box, trb_costs costs) {\n",
+  "  box.count = trb_small(1, costs.ratio * trb_area(box), 1);\n",
+  "  return box;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE trbvh_node trb_parent(trbvh_node l, trbvh_node r, trbvh_u32 first, trb_costs costs) {\n",
+  "  trbvh_node n;\n",
+  "  trbvh_u32 count = trb_count(l.count) + trb_count(r.count);\n",
+  "  n.min[0] = TRB_MIN(l.min[0], r.min[0]); n.max[0] = TRB_MAX(l.max[0], r.max[0]);\n",
+  "  n.min[1] = TRB_MIN(l.min[1], r.min[1]); n.max[1] = TRB_MAX(l.max[1], r.max[1]);\n",
+  "  n.min[2] = TRB_MIN(l.min[2], r.min[2]); n.max[2] = TRB_MAX(l.max[2], r.max[2]);\n",
+  "  n.first = first;\n",
+  "  n.count = count;\n",
+  "  if (count <= costs.max_leaf) {\n",
+  "    float area = trb_area(n), split = area + (trb_cost(l.count) + trb_cost(r.count));\n",
+  "    float leaf = costs.ratio * area * (float)count;\n",
+  "    n.count = trb_small(count, TRB_MIN(leaf, split), leaf <= split);\n",
+  "  }\n",
+  "  return n;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "\n",
+  "#define TRB_GRID_BITS 21\n",
+  "typedef struct trb_grid { float origin[3]; float cells_per_unit, units_per_cell; } trb_grid;\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_cell(float x, float origin, float cells_per_unit) {\n",
+  "  const float last = 2097151.0f;\n",
+  "  float cell = (x - origin) * cells_per_unit;\n",
+  "  cell = TRB_MIN(cell, last);\n",
+  "  return (trbvh_u32)TRB_MAX(cell, 0.0f);\n",
+  "}\n",
+  "\n",
+  "TRB_CORE trb_u64 trb_spread(trbvh_u32 cell) {\n",
+  "  trb_u64 x = cell;\n",
+  "  x = (x | x << 32) & 0x001F00000000FFFFu;\n",
+  "  x = (x | x << 16) & 0x001F0000FF0000FFu;\n",
+  "  x = (x | x << 8)  & 0x100F00F00F00F00Fu;\n",
+  "  x = (x | x << 4)  & 0x10C30C30C30C30C3u;\n",
+  "  return (x | x << 2) & 0x1249249249249249u;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE trb_u64 trb_morton(trbvh_node box, trb_grid grid) {\n",
+  "  trbvh_u32 x = trb_cell(0.5f * box.min[0] + 0.5f * box.max[0], grid.origin[0], grid.cells_per_unit);\n",
+  "  trbvh_u32 y = trb_cell(0.5f * box.min[1] + 0.5f * box.max[1], grid.origin[1], grid.cells_per_unit);\n",
+  "  trbvh_u32 z = trb_cell(0.5f * box.min[2] + 0.5f * box.max[2], grid.origin[2], grid.cells_per_unit);\n",
+  "  return trb_spread(x) << 2 | trb_spread(y) << 1 | trb_spread(z);\n",
+  "}\n",
+  "#line 465 \"trbvh.h\"\n",
+  "#define TRB_TREELET 7\n",
+  "#define TRB_GPU_LANES 32u\n",
+  "#if defined(TRB_CPU)\n",
+  "  #define TRB_LANE   float16\n",
+  "  #define TRB_LANES  16u\n",
+  "  #define TRB_VECTOR 16u\n",
+  "#elif defined(TRB_GPU)\n",
+  "  #define TRB_LANE   float\n",
+  "  #define TRB_LANES  TRB_GPU_LANES\n",
+  "  #define TRB_VECTOR 1u\n",
+  "#else\n",
+  "  #define TRB_LANE   float\n",
+  "  #define TRB_LANES  8u\n",
+  "  #define TRB_VECTOR 1u\n",
+  "#endif\n",
+  "#define TRB_LEAF_VALUES 8\n",
+  "#define TRB_SUBSETS     128\n",
+  "\n",
+  "#define TRB_SINGLE(s)    (((s) & ((s) - 1)) == 0)\n",
+  "#define TRB_BOTH(p, q)   (TRB_SINGLE(p) ? c[q] : TRB_SINGLE(q) ? c[p] : c[p] + c[q])\n",
+  "\n",
+  "#define TRB_Q0(p, q)              { TRB_LANE sum = TRB_BOTH(p, q); best = TRB_MIN(sum, best); }\n",
+  "#define TRB_Q1(p, q, a)           TRB_Q0((p) | (a), q)          TRB_Q0(p, (q) | (a))\n",
+  "#define TRB_Q2(p, q, a, b)        TRB_Q1((p) | (a), q, b)       TRB_Q1(p, (q) | (a), b)\n",
+  "#define TRB_Q3(p, q, a, b, d)     TRB_Q2((p) | (a), q, b, d)    TRB_Q2(p, (q) | (a), b, d)\n",
+  "#define TRB_Q4(p, q, a, b, d, e)  TRB_Q3((p) | (a), q, b, d, e) TRB_Q3(p, (q) | (a), b, d, e)\n",
+  "#define TRB_Q5(p, q, a, b, d, e, f) TRB_Q4((p) | (a), q, b, d, e, f) TRB_Q4(p, (q) | (a), b, d, e, f)\n",
+  "#define TRB_P1(p, a)                TRB_Q0(p, a)\n",
+  "#define TRB_P2(p, a, b)             TRB_Q1(p, a, b)             TRB_P1((p) | (a), b)\n",
+  "#define TRB_P3(p, a, b, d)          TRB_Q2(p, a, b, d)          TRB_P2((p) | (a), b, d)\n",
+  "#define TRB_P4(p, a, b, d, e)       TRB_Q3(p, a, b, d, e)       TRB_P3((p) | (a), b, d, e)\n",
+  "#define TRB_P5(p, a, b, d, e, f)    TRB_Q4(p, a, b, d, e, f)    TRB_P4((p) | (a), b, d, e, f)\n",
+  "#define TRB_P6(p, a, b, d, e, f, g) TRB_Q5(p, a, b, d, e, f, g) TRB_P5((p) | (a), b, d, e, f, g)\n",
+  "\n",
+  "#define TRB_SIDE(s, k, pick) ((s) < 8 ? low[(s) & 7][k] : ((s) & 7) == 0 ? high[(s) >> 3][k] \\\n",
+  "                              : pick(low[(s) & 7][k], high[(s) >> 3][k]))\n",
+  "#define TRB_WIDTH(s, k)      (TRB_SIDE(s, (k) + 3, TRB_MAX) - TRB_SIDE(s, k, TRB_MIN))\n",
+  "#define TRB_UNION(t, s, p, q) \\\n",
+  "  t[s][0] = TRB_MIN(t[p][0], t[q][0]); t[s][3] = TRB_MAX(t[p][3], t[q][3]); \\\n",
+  "  t[s][1] = TRB_MIN(t[p][1], t[q][1]); t[s][4] = TRB_MAX(t[p][4], t[q][4]); \\\n",
+  "  t[s][2] = TRB_MIN(t[p][2], t[q][2]); t[s][5] = TRB_MAX(t[p][5], t[q][5]);\n",
+  "#define TRB_VALUE(i, k) leaves[((i) * TRB_LEAF_VALUES + (k)) * (TRB_LANES / TRB_VECTOR)]\n",
+  "#define TRB_ENTER(t, s, i) \\\n",
+  "  t[s][0] = TRB_VALUE(i, 0); t[s][1] = TRB_VALUE(i, 1); t[s][2] = TRB_VALUE(i, 2); \\\n",
+  "  t[s][3] = TRB_VALUE(i, 3); t[s][4] = TRB_VALUE(i, 4); t[s][5] = TRB_VALUE(i, 5); \\\n",
+  "  n[1 << (i)] = TRB_VALUE(i, 6); u[1 << (i)] = TRB_VALUE(i, 7); c[1 << (i)] = 0;\n",
+  "\n",
+  "#define TRB_SUBSET(s, partitions) { \\\n",
+  "  TRB_LANE x = TRB_WIDTH(s, 0), y = TRB_WIDTH(s, 1), z = TRB_WIDTH(s, 2); \\\n",
+  "  TRB_LANE area = x * y + z * (x + y), best = FLT_MAX, split, leaf, over; \\\n",
+  "  partitions \\\n",
+  "  n[s] = n[(s) & ((s) - 1)] + n[(s) & -(s)]; \\\n",
+  "  u[s] = u[(s) & ((s) - 1)] + u[(s) & -(s)]; \\\n",
+  "  split = area + best; \\\n",
+  "  leaf = ratio * area * n[s] - u[s]; \\\n",
+  "  over = (n[s] - limit) * FLT_MAX; \\\n",
+  "  leaf = TRB_MAX(leaf, over); \\\n",
+  "  c[s] = TRB_MIN(leaf, split); \\\n",
+  "  table[(s) * (TRB_LANES / TRB_VECTOR)] = c[s]; }\n",
+  "#define TRB_S2(i, j) TRB_SUBSET((1 << i | 1 << j), TRB_P1(1 << i, 1 << j))\n",
+  "#define TRB_S3(i, j, k) TRB_SUBSET((1 << i | 1 << j | 1 << k), TRB_P2(1 << i, 1 << j, 1 << k))\n",
+  "#define TRB_S4(i, j, k, l) \\\n",
+  "  TRB_SUBSET((1 << i | 1 << j | 1 << k | 1 << l), TRB_P3(1 << i, 1 << j, 1 << k, 1 << l))\n",
+  "#define TRB_S5(i, j, k, l, m) \\\n",
+  "  TRB_SUBSET((1 << i | 1 << j | 1 << k | 1 << l | 1 << m), TRB_P4(1 << i, 1 << j, 1 << k, 1 << l, 1 << m))\n",
+  "#define TRB_S6(without) TRB_SUBSET((127 ^ 1 << without), TRB_P5(1 << TRB_SKIP(0, without), \\\n",
+  "  1 << TRB_SKIP(1, without), 1 << TRB_SKIP(2, without), 1 << TRB_SKIP(3, without), 1 << TRB_SKIP(4, without), \\\n",
+  "  1 << TRB_SKIP(5, without)))\n",
+  "#define TRB_SKIP(i, without) ((i) + ((i) >= (without)))\n",
+  "\n",
+  "TRB_CORE void trb_treelet_costs(const TRB_WORK TRB_LANE *TRB_RESTRICT leaves, TRB_WORK TRB_LANE *TRB_RESTRICT table,\n",
+  "                                trb_costs costs) {\n",
+  "  const float ratio = costs.ratio, limit = (float)costs.max_leaf + 0.5f;\n",
+  "  TRB_LANE low[8][6], high[16][6], c[TRB_SUBSETS], n[TRB_SUBSETS], u[TRB_SUBSETS];\n",
+  "  TRB_ENTER(low, 1, 0) TRB_ENTER(low, 2, 1) TRB_ENTER(low, 4, 2)\n",
+  "  TRB_ENTER(high, 1, 3) TRB_ENTER(high, 2, 4) TRB_ENTER(high, 4, 5) TRB_ENTER(high, 8, 6)\n",
+  "  TRB_UNION(low, 3, 1, 2) TRB_UNION(low, 5, 1, 4) TRB_UNION(low, 6, 2, 4) TRB_UNION(low, 7, 3, 4)\n",
+  "  TRB_UNION(high, 3, 1, 2)   TRB_UNION(high, 5, 1, 4)   TRB_UNION(high, 6, 2, 4)   TRB_UNION(high, 7, 3, 4)\n",
+  "  TRB_UNION(high, 9, 1, 8)   TRB_UNION(high, 10, 2, 8)  TRB_UNION(high, 11, 3, 8)  TRB_UNION(high, 12, 4, 8)\n",
+  "  TRB_UNION(high, 13, 5, 8)  TRB_UNION(high, 14, 6, 8)  TRB_UNION(high, 15, 7, 8)\n",
+  "  TRB_S2(0, 1) TRB_S2(0, 2) TRB_S2(1, 2) TRB_S2(0, 3) TRB_S2(1, 3) TRB_S2(2, 3) TRB_S2(0, 4)\n",
+  "  TRB_S2(1, 4) TRB_S2(2, 4) TRB_S2(3, 4) TRB_S2(0, 5) TRB_S2(1, 5) TRB_S2(2, 5) TRB_S2(3, 5)\n",
+  "  TRB_S2(4, 5) TRB_S2(0, 6) TRB_S2(1, 6) TRB_S2(2, 6) TRB_S2(3, 6) TRB_S2(4, 6) TRB_S2(5, 6)\n",
+  "  TRB_S3(0, 1, 2) TRB_S3(0, 1, 3) TRB_S3(0, 2, 3) TRB_S3(1, 2, 3) TRB_S3(0, 1, 4) TRB_S3(0, 2, 4) TRB_S3(1, 2, 4)\n",
+  "  TRB_S3(0, 3, 4) TRB_S3(1, 3, 4) TRB_S3(2, 3, 4) TRB_S3(0, 1, 5) TRB_S3(0, 2, 5) TRB_S3(1, 2, 5) TRB_S3(0, 3, 5)\n",
+  "  TRB_S3(1, 3, 5) TRB_S3(2, 3, 5) TRB_S3(0, 4, 5) TRB_S3(1, 4, 5) TRB_S3(2, 4, 5) TRB_S3(3, 4, 5) TRB_S3(0, 1, 6)\n",
+  "  TRB_S3(0, 2, 6) TRB_S3(1, 2, 6) TRB_S3(0, 3, 6) TRB_S3(1, 3, 6) TRB_S3(2, 3, 6) TRB_S3(0, 4, 6) TRB_S3(1, 4, 6)\n",
+  "  TRB_S3(2, 4, 6) TRB_S3(3, 4, 6) TRB_S3(0, 5, 6) TRB_S3(1, 5, 6) TRB_S3(2, 5, 6) TRB_S3(3, 5, 6) TRB_S3(4, 5, 6)\n",
+  "  TRB_S4(0, 1, 2, 3) TRB_S4(0, 1, 2, 4) TRB_S4(0, 1, 3, 4) TRB_S4(0, 2, 3, 4) TRB_S4(1, 2, 3, 4)\n",
+  "  TRB_S4(0, 1, 2, 5) TRB_S4(0, 1, 3, 5) TRB_S4(0, 2, 3, 5) TRB_S4(1, 2, 3, 5) TRB_S4(0, 1, 4, 5)\n",
+  "  TRB_S4(0, 2, 4, 5) TRB_S4(1, 2, 4, 5) TRB_S4(0, 3, 4, 5) TRB_S4(1, 3, 4, 5) TRB_S4(2, 3, 4, 5)\n",
+  "  TRB_S4(0, 1, 2, 6) TRB_S4(0, 1, 3, 6) TRB_S4(0, 2, 3, 6) TRB_S4(1, 2, 3, 6) TRB_S4(0, 1, 4, 6)\n",
+  "  TRB_S4(0, 2, 4, 6) TRB_S4(1, 2, 4, 6) TRB_S4(0, 3, 4, 6) TRB_S4(1, 3, 4, 6) TRB_S4(2, 3, 4, 6)\n",
+  "  TRB_S4(0, 1, 5, 6) TRB_S4(0, 2, 5, 6) TRB_S4(1, 2, 5, 6) TRB_S4(0, 3, 5, 6) TRB_S4(1, 3, 5, 6)\n",
+  "  TRB_S4(2, 3, 5, 6) TRB_S4(0, 4, 5, 6) TRB_S4(1, 4, 5, 6) TRB_S4(2, 4, 5, 6) TRB_S4(3, 4, 5, 6)\n",
+  "  TRB_S5(0, 1, 2, 3, 4) TRB_S5(0, 1, 2, 3, 5) TRB_S5(0, 1, 2, 4, 5) TRB_S5(0, 1, 3, 4, 5) TRB_S5(0, 2, 3, 4, 5)\n",
+  "  TRB_S5(1, 2, 3, 4, 5) TRB_S5(0, 1, 2, 3, 6) TRB_S5(0, 1, 2, 4, 6) TRB_S5(0, 1, 3, 4, 6) TRB_S5(0, 2, 3, 4, 6)\n",
+  "  TRB_S5(1, 2, 3, 4, 6) TRB_S5(0, 1, 2, 5, 6) TRB_S5(0, 1, 3, 5, 6) TRB_S5(0, 2, 3, 5, 6) TRB_S5(1, 2, 3, 5, 6)\n",
+  "  TRB_S5(0, 1, 4, 5, 6) TRB_S5(0, 2, 4, 5, 6) TRB_S5(1, 2, 4, 5, 6) TRB_S5(0, 3, 4, 5, 6) TRB_S5(1, 3, 4, 5, 6)\n",
+  "  TRB_S5(2, 3, 4, 5, 6)\n",
+  "  TRB_S6(6) TRB_S6(5) TRB_S6(4) TRB_S6(3) TRB_S6(2) TRB_S6(1) TRB_S6(0)\n",
+  "  TRB_SUBSET(127, TRB_P6(1, 2, 4, 8, 16, 32, 64))\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_partition(const TRB_WORK float *table, trbvh_u32 s) {\n",
+  "  trbvh_u32 rest = s & (s - 1), q = 0, best_q = 0;\n",
+  "  float best = 0;\n",
+  "  do {\n",
+  "    float sum;\n",
+  "    trbvh_u32 p;\n",
+  "    q = (q - rest) & rest;\n",
+  "    p = s ^ q;\n",
+  "    sum = (TRB_SINGLE(p) ? 0 : table[p * TRB_LANES]) + (TRB_SINGLE(q) ? 0 : table[q * TRB_LANES]);\n",
+  "    if (best_q == 0 || sum < best) { best = sum; best_q = q; }\n",
+  "  } while (q != rest);\n",
+  "  return s ^ best_q;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_expand_key(trbvh_node n, trbvh_u32 slot) {\n",
+  "  return trb_count(n.count) == 1 ? 0 : (trb_bits(trb_area(n)) & ~7u) | (TRB_TREELET - slot);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE int trb_improves(float cost, float old_cost) { return cost < old_cost - old_cost * 3.8147e-6f; }\n",
+  "#line 597 \"trbvh.h\"\n",
+  "typedef struct trb_plane { int axis, level; float position; } trb_plane;\n",
+  "#define TRB_TINY 1e-30f\n",
+  "\n",
+  "TRB_CORE trb_plane trb_median_plane(trbvh_node box, trb_grid grid) {\n",
+  "  trb_plane plane;\n",
+  "  int k;\n",
+  "  plane.axis = 0; plane.level = -TRB_GRID_BITS - 1; plane.position = 0;\n",
+  "  for (k = 0; k < 3; k++) {\n",
+  "    trbvh_u32 low = trb_cell(box.min[k], grid.origin[k], grid.cells_per_unit);\n",
+  "    trbvh_u32 high = trb_cell(box.max[k], grid.origin[k], grid.cells_per_unit);\n",
+  "    if (low != high) {\n",
+  "      int bit = (int)trb_log2(low ^ high);\n",
+  "      if (bit - TRB_GRID_BITS > plane.level) {\n",
+  "        plane.level = bit - TRB_GRID_BITS;\n",
+  "        plane.axis = k;\n",
+  "        plane.position = grid.origin[k] + (float)(high >> bit << bit) * grid.units_per_cell;\n",
+  "      }\n",
+  "    }\n",
+  "  }\n",
+  "  return plane;\n",
+  "}\n",
+  "\n",
+  "TRB_CORE float trb_split_priority(const float v[3][3], trbvh_node box, trb_grid grid) {\n",
+  "  float ax = v[1][0] - v[0][0], ay = v[1][1] - v[0][1], az = v[1][2] - v[0][2];\n",
+  "  float bx = v[2][0] - v[0][0], by = v[2][1] - v[0][1], bz = v[2][2] - v[0][2];\n",
+  "  float ideal = trb_abs(ay * bz - az * by) + trb_abs(az * bx - ax * bz) + trb_abs(ax * by - ay * bx);\n",
+  "  float empty = 2.0f * trb_area(box) - ideal;\n",
+  "  float weight = trb_float((trbvh_u32)(127 + trb_median_plane(box, grid).level) << 23);\n",
+  "  return empty > 0 && empty < FLT_MAX ? trb_cube_root(weight * empty) : 0;\n",
+  "}\n",
+  "\n",
+  "TRB_CORE float trb_longest_side(trbvh_node box) {\n",
+  "  float x = box.max[0] - box.min[0], y = box.max[1] - box.min[1], z = box.max[2] - box.min[2], xy = TRB_MAX(x, y);\n",
+  "  return TRB_MAX(xy, z);\n",
+  "}\n",
+  "\n",
+  "TRB_CORE int trb_cuts(trbvh_node box, trb_plane plane) {\n",
+  "  const int k = plane.axis;\n",
+  "  return plane.position > box.min[k] && plane.position < box.max[k] && box.max[k] - box.min[k] > TRB_TINY;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "\n",
+  "TRB_CORE int trb_choose_plane(trbvh_node box, trb_grid grid, trb_plane *plane) {\n",
+  "  const float longest = trb_longest_side(box);\n",
+  "  int k;\n",
+  "  *plane = trb_median_plane(box, grid);\n",
+  "  if (!(longest > TRB_TINY && longest < 1 / TRB_TINY)) return 0;\n",
+  "  if (plane->level > -TRB_GRID_BITS - 1 && trb_cuts(box, *plane)) return 1;\n",
+  "  for (k = 0; box.max[k] - box.min[k] < longest; k++) {}\n",
+  "  plane->axis = k;\n",
+  "  plane->position = 0.5f * box.min[k] + 0.5f * box.max[k];\n",
+  "  return trb_cuts(box, *plane);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_share(trbvh_u32 splits, float left, float right) {\n",
+  "  float both = left + right;\n",
+  "  float share = both > TRB_TINY && both < 1 / TRB_TINY ? left * trb_reciprocal(both) : 0.5f;\n",
+  "  trbvh_u32 n = (trbvh_u32)((float)splits * share + 0.5f);\n",
+  "  return TRB_MIN(n, splits);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "#define TRB_POLYGON 10\n",
+  "TRB_CORE int trb_cut(float polygon[TRB_POLYGON][3], int n, int k, float position, float sign) {\n",
+  "  float kept[TRB_POLYGON][3];\n",
+  "  int i, j, count = 0;\n",
+  "  for (i = 0; i < n; i++) {\n",
+  "    int next = i + 1 < n ? i + 1 : 0;\n",
+  "    float a = (polygon[i][k] - position) * sign, b = (polygon[next][k] - position) * sign;\n",
+  "    if (a >= -TRB_TINY && count < TRB_POLYGON) {\n",
+  "      for (j = 0; j < 3; j++) kept[count][j] = polygon[i][j];\n",
+  "      count++;\n",
+  "    }\n",
+  "    if (((a > 0 && b < -TRB_TINY) || (a < -TRB_TINY && b > 0)) && count < TRB_POLYGON) {\n",
+  "      float t = trb_abs(a) * trb_reciprocal(trb_abs(a) + trb_abs(b));\n",
+  "      for (j = 0; j < 3; j++) kept[count][j] = polygon[i][j] + (polygon[next][j] - polygon[i][j]) * t;\n",
+  "      kept[count][k] = position;\n",
+  "      count++;\n",
+  "    }\n",
+  "  }\n",
+  "  for (i = 0; i < count; i++)\n",
+  "    for (j = 0; j < 3; j++) polygon[i][j] = kept[i][j];\n",
+  "  return count;\n",
+  "}\n",
+  "#line 688 \"trbvh.h\"\n",
+  "TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {\n",
+  "  float polygon[TRB_POLYGON][3], pad[3];\n",
+  "  trbvh_node bounds = *box;\n",
+  "  int i, j, k, n = 3;\n",
+  "  for (i = 0; i < 3; i++)\n",
+  "    for (j = 0; j < 3; j++) polygon[i][j] = v[i][j];\n",
+  "  for (k = 0; k < 3; k++) {\n",
+  "    float a = trb_abs(v[0][k]), b = trb_abs(v[1][k]), c = trb_abs(v[2][k]), ab = TRB_MAX(a, b);\n",
+  "    pad[k] = TRB_MAX(ab, c) * 9.5367432e-7f;\n",
+  "    n = trb_cut(polygon, n, k, box->min[k] - pad[k], 1);\n",
+  "    n = trb_cut(polygon, n, k, box->max[k] + pad[k], -1);\n",
+  "  }\n",
+  "  if (n == 0) return 0;\n",
+  "  for (k = 0; k < 3; k++) {\n",
+  "    float low = polygon[0][k], high = polygon[0][k];\n",
+  "    for (i = 1; i < n; i++) {\n",
+  "      low = TRB_MIN(low, polygon[i][k]);\n",
+  "      high = TRB_MAX(high, polygon[i][k]);\n",
+  "    }\n",
+  "    low -= 0.5f * pad[k];\n",
+  "    high += 0.5f * pad[k];\n",
+  "    bounds.min[k] = TRB_MAX(low, box->min[k]);\n",
+  "    bounds.max[k] = TRB_MIN(high, box->max[k]);\n",
+  "    if (!(bounds.min[k] <= bounds.max[k])) return 0;\n",
+  "  }\n",
+  "  *box = bounds;\n",
+  "  return 1;\n",
+  "}\n",
+  "#line 720 \"trbvh.h\"\n",
+  "  typedef struct trb_mesh {\n",
+  "    const __global char *positions, *indices, *boxes;\n",
+  "    ulong position_stride, box_stride;\n",
+  "    uint position_count, index_size, count;\n",
+  "  } trb_mesh;\n",
+  "\n",
+  "\n",
+  "\n",
+  "#define TRB_AHEAD 32u\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_load_position(float out[3], const TRB_GLOBAL char *p) {\n",
+  "\n",
+  "  const __global float *position = (const __global float *)p;\n",
+  "  out[0] = position[0];\n",
+  "  out[1] = position[1];\n",
+  "  out[2] = position[2];\n",
+  "\n",
+  "\n",
+  "\n",
+  "}\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_index(const trb_mesh *mesh, size_t i) {\n",
+  "\n",
+  "  return mesh->index_size == 2 ? ((const __global ushort *)mesh->indices)[i] : ((const __global uint *)mesh->indices)[i];\n",
+  "#line 755 \"trbvh.h\"\n",
+  "}\n",
+  "\n",
+  "TRB_CORE const TRB_GLOBAL char *trb_position(const trb_mesh *mesh, size_t i) {\n",
+  "  return (const TRB_GLOBAL char *)mesh->positions + i * mesh->position_stride;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED int trb_load_triangle(const trb_mesh *mesh, trbvh_u32 i, float v[3][3], trbvh_u32 *vertex) {\n",
+  "  size_t k, corner = (size_t)i * 3;\n",
+  "  for (k = 0; k < 3; k++) {\n",
+  "    size_t position = corner + k;\n",
+  "    if (mesh->indices) {\n",
+  "      *vertex = trb_index(mesh, corner + k);\n",
+  "      if (*vertex >= mesh->position_count) return 0;\n",
+  "      position = *vertex;\n",
+  "    }\n",
+  "    trb_load_position(v[k], trb_position(mesh, position));\n",
+  "  }\n",
+  "  return 1;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_prefetch_indices(const trb_mesh *mesh, trbvh_u32 i) {\n",
+  "  if (mesh->indices) TRB_PREFETCH((const TRB_GLOBAL char *)mesh->indices + (size_t)i * 3 * mesh->index_size);\n",
+  "}\n",
+  "\n",
+  "TRB_CORE void trb_prefetch_positions(const trb_mesh *mesh, trbvh_u32 i) {\n",
+  "  size_t k, corner = (size_t)i * 3;\n",
+  "  for (k = 0; k < 3; k++)\n",
+  "    TRB_PREFETCH(trb_position(mesh, mesh->indices ? trb_index(mesh, corner + k) : corner + k));\n",
+  "}\n",
+  "\n",
+  "TRB_SHARED trbvh_node trb_no_box(void) {\n",
+  "  trbvh_node n;\n",
+  "  int k;\n",
+  "  for (k = 0; k < 3; k++) { n.min[k] = FLT_MAX; n.max[k] = -FLT_MAX; }\n",
+  "  n.first = n.count = 0;\n",
+  "  return n;\n",
+  "}\n",
+  "\n",
+  "TRB_SHARED void trb_include(trbvh_node *n, const float low[3], const float high[3]) {\n",
+  "  int k;\n",
+  "  for (k = 0; k < 3; k++) {\n",
+  "    n->min[k] = TRB_MIN(low[k], n->min[k]);\n",
+  "    n->max[k] = TRB_MAX(high[k], n->max[k]);\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED int trb_triangle_box(const float v[3][3], trbvh_node *box) {\n",
+  "  int k, finite = 1;\n",
+  "  for (k = 0; k < 3; k++) {\n",
+  "    float low = TRB_MIN(v[0][k], v[1][k]), high = TRB_MAX(v[0][k], v[1][k]);\n",
+  "    box->min[k] = TRB_MIN(v[2][k], low);\n",
+  "    box->max[k] = TRB_MAX(v[2][k], high);\n",
+  "    finite &= trb_finite(v[0][k]) & trb_finite(v[1][k]) & trb_finite(v[2][k]);\n",
+  "  }\n",
+  "  box->first = box->count = 0;\n",
+  "  return finite;\n",
+  "}\n",
+  "\n",
+  "TRB_SHARED int trb_valid_box(trbvh_node box) {\n",
+  "  int k, valid = 1;\n",
+  "  for (k = 0; k < 3; k++) valid &= trb_finite(box.min[k]) & trb_finite(box.max[k]) & (box.min[k] <= box.max[k]);\n",
+  "  return valid;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "\n",
+  "TRB_SHARED int trb_prim_box(const trb_mesh *mesh, trbvh_u32 i, trbvh_node *box, float v[3][3], trbvh_u32 *vertex) {\n",
+  "  const TRB_GLOBAL char *p;\n",
+  "  if (!mesh->boxes) return trb_load_triangle(mesh, i, v, vertex) ? trb_triangle_box((const float (*)[3])v, box) : -1;\n",
+  "  p = (const TRB_GLOBAL char *)mesh->boxes + (size_t)i * mesh->box_stride;\n",
+  "  trb_load_position(box->min, p);\n",
+  "  trb_load_position(box->max, p + 12);\n",
+  "  box->first = box->count = 0;\n",
+  "  return trb_valid_box(*box);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED trb_grid trb_make_grid(trbvh_node bounds) {\n",
+  "  trb_grid grid;\n",
+  "  float extent = 0;\n",
+  "  int k;\n",
+  "  for (k = 0; k < 3; k++) {\n",
+  "    float side = bounds.max[k] - bounds.min[k];\n",
+  "    grid.origin[k] = bounds.min[k];\n",
+  "    extent = TRB_MAX(side, extent);\n",
+  "  }\n",
+  "  grid.units_per_cell = extent * (1.0f / 2097152.0f);\n",
+  "  grid.cells_per_unit = extent > 1e-30f && extent < FLT_MAX ? trb_reciprocal(grid.units_per_cell) : 0;\n",
+  "  return grid;\n",
+  "}\n",
+  "#line 855 \"trbvh.h\"\n",
+  "#define TRB_SCALE_BITS  36\n",
+  "#define TRB_SCALES      2561u\n",
+  "#define TRB_SPLIT_STACK 64u\n",
+  "\n",
+  "TRB_CORE trb_u64 trb_scale(trbvh_u32 i) { return (trb_u64)(64 + (i & 63)) << (i >> 6) >> 6; }\n",
+  "\n",
+  "\n",
+  "TRB_CORE float trb_priority_unit(float largest) {\n",
+  "  trbvh_u32 exponent = trb_bits(largest) >> 23;\n",
+  "  return trb_float((127u + 127u + 23u - TRB_MAX(exponent, 24u)) << 23);\n",
+  "}\n",
+  "\n",
+  "TRB_CORE trb_u64 trb_splits(float priority, float unit, trb_u64 scale) {\n",
+  "  return ((trb_u64)(trbvh_u32)(priority * unit) * scale) >> TRB_SCALE_BITS;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED trbvh_u32 trb_split_reference(const trb_mesh *mesh, trb_grid grid, trbvh_node ref, trbvh_u32 splits,\n",
+  "                                         TRB_GLOBAL trbvh_node *out) {\n",
+  "  struct { trbvh_node box; trbvh_u32 splits; } stack[TRB_SPLIT_STACK];\n",
+  "  trbvh_u32 top = 0, count = 0, vertex;\n",
+  "  float v[3][3];\n",
+  "  if (splits) trb_load_triangle(mesh, ref.first, v, &vertex);\n",
+  "  stack[top].box = ref;\n",
+  "  stack[top++].splits = splits;\n",
+  "  while (top) {\n",
+  "    trbvh_node left, right;\n",
+  "    trb_plane plane;\n",
+  "    int in_left, in_right;\n",
+  "    trbvh_u32 rest = stack[--top].splits;\n",
+  "    left = right = stack[top].box;\n",
+  "    if (rest == 0 || top + 2 > TRB_SPLIT_STACK || !trb_choose_plane(left, grid, &plane)) {\n",
+  "      out[count++] = left;\n",
+  "      continue;\n",
+  "    }\n",
+  "    left.max[plane.axis] = right.min[plane.axis] = plane.position;\n",
+  "    in_left = trb_clip((const float (*)[3])v, &left);\n",
+  "    in_right = trb_clip((const float (*)[3])v, &right);\n",
+  "    if (in_left && in_right) {\n",
+  "      trbvh_u32 share = trb_share(--rest, trb_longest_side(left), trb_longest_side(right));\n",
+  "      stack[top].box = right;\n",
+  "      stack[top++].splits = rest - share;\n",
+  "      stack[top].box = left;\n",
+  "      stack[top++].splits = share;\n",
+  "    } else if (in_left || in_right) {\n",
+  "      stack[top].box = in_left ? left : right;\n",
+  "      stack[top++].splits = rest - 1;\n",
+  "    } else {\n",
+  "      out[count++] = stack[top].box;\n",
+  "    }\n",
+  "  }\n",
+  "  return count;\n",
+  "}\n",
+  "#line 914 \"trbvh.h\"\n",
+  "#ifndef TRB_PACKED_REFS\n",
+  "  #define TRB_PACKED_REFS (1u << 24)\n",
+  "#endif\n",
+  "#define TRB_CODE_BITS  44u\n",
+  "#define TRB_DIGIT_BITS 11u\n",
+  "#define TRB_DIGITS     (1u << TRB_DIGIT_BITS)\n",
+  "#define TRB_SORT_BLOCK 65536u\n",
+  "\n",
+  "\n",
+  "typedef struct trb_key_form { trbvh_u32 packed, bits, shift; } trb_key_form;\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_key_ref(trb_u64 key, trb_key_form form) {\n",
+  "  return (trbvh_u32)(key & (((trb_u64)1 << form.shift) - 1));\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE trb_u64 trb_key(trbvh_node box, trbvh_u32 ref, trb_grid grid, trb_key_form form, int high) {\n",
+  "  trb_u64 code = trb_morton(box, grid);\n",
+  "  if (form.packed) code >>= 63 - form.bits;\n",
+  "  else code = high ? code >> 31 : code & 0x7FFFFFFFu;\n",
+  "  return code << form.shift | ref;\n",
+  "}\n",
+  "\n",
+  "TRB_SHARED void trb_count_digits(const TRB_GLOBAL trb_u64 *keys, trbvh_u32 count, trbvh_u32 shift,\n",
+  "                                 TRB_GLOBAL trbvh_u32 *histogram) {\n",
+  "  trbvh_u32 i;\n",
+  "  for (i = 0; i < TRB_DIGITS; i++) histogram[i] = 0;\n",
+  "  for (i = 0; i < count; i++) histogram[(keys[i] >> shift) & (TRB_DIGITS - 1)]++;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_scatter_keys(const TRB_GLOBAL trb_u64 *keys, trbvh_u32 count, trbvh_u32 shift,\n",
+  "                                 TRB_GLOBAL trbvh_u32 *next, TRB_GLOBAL trb_u64 *sorted) {\n",
+  "  trbvh_u32 i;\n",
+  "  for (i = 0; i < count; i++) {\n",
+  "    trb_u64 key = keys[i];\n",
+  "    sorted[next[(key >> shift) & (TRB_DIGITS - 1)]++] = key;\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_place_digits(TRB_GLOBAL trbvh_u32 *histograms, trbvh_u32 blocks) {\n",
+  "  trbvh_u32 digit, block, start = 0;\n",
+  "  for (digit = 0; digit < TRB_DIGITS; digit++)\n",
+  "    for (block = 0; block < blocks; block++) {\n",
+  "      TRB_GLOBAL trbvh_u32 *count = histograms + (size_t)block * TRB_DIGITS + digit;\n",
+  "      trbvh_u32 n = *count;\n",
+  "      *count = start;\n",
+  "      start += n;\n",
+  "    }\n",
+  "}\n",
+  "#line 972 \"trbvh.h\"\n",
+  "#define TRB_BLOCK    16384u\n",
+  "#define TRB_OPEN_MAX 200u\n",
+  "#define TRB_NO_SPLIT (~(trb_u64)0)\n",
+  "\n",
+  "\n",
+  "typedef struct trb_curve {\n",
+  "  const TRB_GLOBAL trb_u64    *keys;\n",
+  "  const TRB_GLOBAL trbvh_node *refs;\n",
+  "  trb_grid     grid;\n",
+  "  trb_key_form form;\n",
+  "  trbvh_u32    count;\n",
+  "} trb_curve;\n",
+  "\n",
+  "\n",
+  "TRB_CORE trb_u64 trb_split_after(const trb_curve *c, trbvh_u32 i) {\n",
+  "  trb_u64 a, b, code;\n",
+  "  if (i >= c->count - 1) return TRB_NO_SPLIT;\n",
+  "  a = c->keys[i];\n",
+  "  b = c->keys[i + 1];\n",
+  "  if (c->form.packed) return a ^ b;\n",
+  "  code = trb_morton(c->refs[trb_key_ref(a, c->form)], c->grid) ^ trb_morton(c->refs[trb_key_ref(b, c->form)], c->grid);\n",
+  "  return code ? code | (trb_u64)1 << 63 : (trbvh_u32)(a ^ b);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "\n",
+  "typedef struct trb_open { trbvh_node node; trb_u64 split; trbvh_u32 pair; } trb_open;\n",
+  "typedef struct trb_range { trbvh_u32 open_count; trb_open open[TRB_OPEN_MAX]; } trb_range;\n",
+  "\n",
+  "typedef struct trb_forest {\n",
+  "  TRB_GLOBAL trbvh_node *nodes;\n",
+  "  TRB_GLOBAL trb_range  *range;\n",
+  "  trb_costs  costs;\n",
+  "  trb_u64    left_split;\n",
+  "  trbvh_u32  next_pair, height;\n",
+  "  trb_open   stack[TRB_OPEN_MAX];\n",
+  "} trb_forest;\n",
+  "\n",
+  "TRB_CORE trbvh_node trb_join(trb_forest *f, trbvh_node left, trbvh_node right, trbvh_u32 pair) {\n",
+  "  f->nodes[2 * pair] = left;\n",
+  "  f->nodes[2 * pair + 1] = right;\n",
+  "  return trb_parent(left, right, 2 * pair, f->costs);\n",
+  "}\n",
+  "\n",
+  "TRB_SHARED void trb_leave_open(trb_forest *f, const trb_open *subtree) {\n",
+  "  TRBVH_ASSERT(f->range->open_count < TRB_OPEN_MAX);\n",
+  "  f->range->open[f->range->open_count++] = *subtree;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_push(trb_forest *f, trbvh_node node, trb_u64 split, trbvh_u32 pair) {\n",
+  "  trb_open *top;\n",
+  "  while (f->height && f->stack[f->height - 1].split <= split) {\n",
+  "    top = &f->stack[--f->height];\n",
+  "    if (f->height || f->left_split >= top->split) {\n",
+  "      node = trb_join(f, top->node, node, top->pair ? top->pair : f->next_pair++);\n",
+  "    } else {\n",
+  "      f->left_split = top->split;\n",
+  "      trb_leave_open(f, top);\n",
+  "    }\n",
+  "  }\n",
+  "  TRBVH_ASSERT(f->height < TRB_OPEN_MAX);\n",
+  "  top = &f->stack[f->height++];\n",
+  "  top->node = node;\n",
+  "  top->split = split;\n",
+  "  top->pair = pair;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_build_block(const trb_curve *curve, trbvh_u32 first, trbvh_u32 end, trb_costs costs,\n",
+  "                                TRB_GLOBAL trbvh_node *nodes, TRB_GLOBAL trb_range *range) {\n",
+  "  trbvh_u32 i;\n",
+  "  trb_forest f;\n",
+  "  f.nodes = nodes;\n",
+  "  f.range = range;\n",
+  "  f.costs = costs;\n",
+  "  f.left_split = trb_split_after(curve, first - 1);\n",
+  "  f.next_pair = first + 1;\n",
+  "  f.height = 0;\n",
+  "  range->open_count = 0;\n",
+  "  for (i = first; i < end; i++) {\n",
+  "    trbvh_node ref = curve->refs[trb_key_ref(curve->keys[i], curve->form)];\n",
+  "    if (i + TRB_AHEAD < end) TRB_PREFETCH(&curve->refs[trb_key_ref(curve->keys[i + TRB_AHEAD], curve->form)]);\n",
+  "    trb_push(&f, trb_reference(ref, costs), trb_split_after(curve, i), 0);\n",
+  "  }\n",
+  "  for (i = 0; i < f.height; i++) trb_leave_open(&f, &f.stack[i]);\n",
+  "  for (i = 0; i < range->open_count; i++) range->open[i].pair = f.next_pair + i;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_build_top(TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trb_range *ranges, trbvh_u32 blocks,\n",
+  "                              trb_costs costs) {\n",
+  "  trbvh_u32 i, k;\n",
+  "  trb_forest f;\n",
+  "  f.nodes = nodes;\n",
+  "  f.range = 0;\n",
+  "  f.costs = costs;\n",
+  "  f.left_split = TRB_NO_SPLIT;\n",
+  "  f.next_pair = f.height = 0;\n",
+  "  for (i = 0; i < blocks; i++)\n",
+  "    for (k = 0; k < ranges[i].open_count; k++)\n",
+  "      trb_push(&f, ranges[i].open[k].node, ranges[i].open[k].split, ranges[i].open[k].pair);\n",
+  "  TRBVH_ASSERT(f.height == 1);\n",
+  "  nodes[0] = f.stack[0].node;\n",
+  "}\n",
+  "#line 1088 \"trbvh.h\"\n",
+  "typedef struct trb_treelets {\n",
+  "  float     leaves[TRB_TREELET * TRB_LEAF_VALUES * TRB_LANES];\n",
+  "  float     table[TRB_SUBSETS * TRB_LANES + 16];\n",
+  "  float     area[TRB_TREELET - 1][TRB_LANES];\n",
+  "  trbvh_u32 slot[TRB_TREELET][TRB_LANES];\n",
+  "  trbvh_u32 key[TRB_TREELET][TRB_LANES];\n",
+  "  trbvh_u32 pair[TRB_TREELET - 1][TRB_LANES];\n",
+  "  trbvh_u32 parent[TRB_TREELET - 1][TRB_LANES];\n",
+  "} trb_treelets;\n",
+  "\n",
+  "TRB_CORE void trb_expand(const TRB_GLOBAL trbvh_node *nodes, TRB_WORK trb_treelets *t, trbvh_u32 lane, trbvh_u32 step,\n",
+  "                         trbvh_u32 slot, trbvh_u32 node) {\n",
+  "  trbvh_u32 pair = nodes[node].first;\n",
+  "  t->area[step][lane] = trb_area(nodes[node]);\n",
+  "  t->pair[step][lane] = pair;\n",
+  "  t->parent[step][lane] = slot;\n",
+  "  t->slot[slot][lane] = pair;\n",
+  "  t->slot[step + 1][lane] = pair + 1;\n",
+  "  t->key[slot][lane] = trb_expand_key(nodes[pair], slot);\n",
+  "  t->key[step + 1][lane] = trb_expand_key(nodes[pair + 1], step + 1);\n",
+  "}\n",
+  "\n",
+  "TRB_CORE void trb_expand_largest(const TRB_GLOBAL trbvh_node *nodes, TRB_WORK trb_treelets *t, trbvh_u32 lane,\n",
+  "                                 trbvh_u32 step) {\n",
+  "  trbvh_u32 best = t->key[0][lane], i;\n",
+  "  for (i = 1; i <= step; i++) best = TRB_MAX(t->key[i][lane], best);\n",
+  "  i = TRB_TREELET - (best & 7u);\n",
+  "  trb_expand(nodes, t, lane, step, i, t->slot[i][lane]);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_enter_leaf(const TRB_GLOBAL trbvh_node *nodes, TRB_WORK trb_treelets *t, trbvh_u32 lane, trbvh_u32 i) {\n",
+  "  const TRB_GLOBAL trbvh_node *leaf = &nodes[t->slot[i][lane]];\n",
+  "  TRB_WORK float *value = &t->leaves[i * TRB_LEAF_VALUES * TRB_LANES + lane];\n",
+  "  value[0 * TRB_LANES] = leaf->min[0];\n",
+  "  value[1 * TRB_LANES] = leaf->min[1];\n",
+  "  value[2 * TRB_LANES] = leaf->min[2];\n",
+  "  value[3 * TRB_LANES] = leaf->max[0];\n",
+  "  value[4 * TRB_LANES] = leaf->max[1];\n",
+  "  value[5 * TRB_LANES] = leaf->max[2];\n",
+  "  value[6 * TRB_LANES] = (float)trb_count(leaf->count);\n",
+  "  value[7 * TRB_LANES] = trb_cost(leaf->count);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED float trb_present_cost(TRB_WORK trb_treelets *t, trbvh_u32 lane, trb_costs costs) {\n",
+  "  float cost[TRB_TREELET] = {0, 0, 0, 0, 0, 0, 0};\n",
+  "  trbvh_u32 step = TRB_TREELET - 1;\n",
+  "  while (step--) {\n",
+  "    trbvh_u32 left = t->parent[step][lane], right = step + 1;\n",
+  "    TRB_WORK float *l = &t->leaves[left * TRB_LEAF_VALUES * TRB_LANES + lane];\n",
+  "    const TRB_WORK float *r = &t->leaves[right * TRB_LEAF_VALUES * TRB_LANES + lane];\n",
+  "    float area = t->area[step][lane];\n",
+  "    l[6 * TRB_LANES] += r[6 * TRB_LANES];\n",
+  "    l[7 * TRB_LANES] += r[7 * TRB_LANES];\n",
+  "    cost[left] = area + (cost[left] + cost[right]);\n",
+  "    if (l[6 * TRB_LANES] <= (float)costs.max_leaf) {\n",
+  "      float leaf = costs.ratio * area * l[6 * TRB_LANES] - l[7 * TRB_LANES];\n",
+  "      cost[left] = TRB_MIN(leaf, cost[left]);\n",
+  "    }\n",
+  "  }\n",
+  "  return cost[0];\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_sort_pairs(const TRB_WORK trb_treelets *t, trbvh_u32 lane, trbvh_u32 pairs[TRB_TREELET - 1]) {\n",
+  "  trbvh_u32 i, k;\n",
+  "  for (i = 0; i < TRB_TREELET - 1; i++) {\n",
+  "    trbvh_u32 pair = t->pair[i][lane];\n",
+  "    for (k = i; k > 0 && pairs[k - 1] < pair; k--) pairs[k] = pairs[k - 1];\n",
+  "    pairs[k] = pair;\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_rebuild_treelet(TRB_GLOBAL trbvh_node *nodes, const TRB_WORK trb_treelets *t, trbvh_u32 lane,\n",
+  "                                    trbvh_u32 root, trb_costs costs) {\n",
+  "  trbvh_node leaf[TRB_TREELET];\n",
+  "  trbvh_u32 pairs[TRB_TREELET - 1], node[TRB_TREELET - 1], i, side, waiting = 0;\n",
+  "  trbvh_u32 stack_node[TRB_TREELET], stack_subset[TRB_TREELET];\n",
+  "  for (i = 0; i < TRB_TREELET; i++) leaf[i] = nodes[t->slot[i][lane]];\n",
+  "  trb_sort_pairs(t, lane, pairs);\n",
+  "  stack_node[waiting] = root;\n",
+  "  stack_subset[waiting++] = TRB_SUBSETS - 1;\n",
+  "  for (i = 0; waiting; i++) {\n",
+  "    trbvh_u32 subset = stack_subset[--waiting], part = trb_partition(t->table + lane, subset);\n",
+  "    node[i] = stack_node[waiting];\n",
+  "    for (side = 0; side < 2; side++, part ^= subset) {\n",
+  "      if (TRB_SINGLE(part)) {\n",
+  "        nodes[pairs[i] + side] = leaf[trb_log2(part)];\n",
+  "      } else {\n",
+  "        stack_node[waiting] = pairs[i] + side;\n",
+  "        stack_subset[waiting++] = part;\n",
+  "      }\n",
+  "    }\n",
+  "  }\n",
+  "  while (i--) nodes[node[i]] = trb_parent(nodes[pairs[i]], nodes[pairs[i] + 1], pairs[i], costs);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_finish_treelet(TRB_GLOBAL trbvh_node *nodes, TRB_WORK trb_treelets *t, trbvh_u32 lane, trbvh_u32 root,\n",
+  "                                 trb_costs costs) {\n",
+  "  float best = t->table[(TRB_SUBSETS - 1) * TRB_LANES + lane];\n",
+  "  TRB_GLOBAL trbvh_node *node = &nodes[root];\n",
+  "  if (trb_improves(best, trb_present_cost(t, lane, costs))) trb_rebuild_treelet(nodes, t, lane, root, costs);\n",
+  "  else if (trb_count(node->count) <= costs.max_leaf)\n",
+  "    *node = trb_parent(nodes[node->first], nodes[node->first + 1], node->first, costs);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_restructure(TRB_GLOBAL trbvh_node *nodes, TRB_WORK trb_treelets *t, const TRB_GLOBAL trbvh_u32 *roots,\n",
+  "                                trbvh_u32 lanes, trb_costs costs) {\n",
+  "  trbvh_u32 lane, i;\n",
+  "  for (lane = 0; lane < lanes; lane++) trb_expand(nodes, t, lane, 0, 0, roots[lane]);\n",
+  "  for (i = 1; i < TRB_TREELET - 1; i++)\n",
+  "    for (lane = 0; lane < lanes; lane++) trb_expand_largest(nodes, t, lane, i);\n",
+  "  for (i = 0; i < TRB_TREELET; i++)\n",
+  "    for (lane = 0; lane < lanes; lane++) trb_enter_leaf(nodes, t, lane, i);\n",
+  "  for (lane = 0; lane < TRB_LANES; lane += TRB_VECTOR)\n",
+  "    trb_treelet_costs((const TRB_WORK TRB_LANE *)(t->leaves + lane), (TRB_WORK TRB_LANE *)(t->table + lane), costs);\n",
+  "  for (lane = 0; lane < lanes; lane++) trb_finish_treelet(nodes, t, lane, roots[lane], costs);\n",
+  "}\n",
+  "\n",
+  "#if !defined(TRBVH_OPENCL_C) || defined(TRB_CPU)\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_restructure_below(TRB_GLOBAL trbvh_node *nodes, TRB_GLOBAL trbvh_u32 *space, trbvh_u32 room,\n",
+  "                                      trbvh_u32 seeds, trbvh_u32 smallest, trb_costs costs) {\n",
+  "  TRB_GLOBAL trbvh_u32 *node = space, *parent = space + room, *height = parent + room, *sorted = height + room;\n",
+  "  TRB_GLOBAL trbvh_u32 *start = parent;\n",
+  "  trbvh_u32 count = seeds, highest = 0, i, k;\n",
+  "  TRB_ALIGNED(trb_treelets) t;\n",
+  "  for (i = 0; i < TRB_TREELET * TRB_LEAF_VALUES * TRB_LANES; i++) t.leaves[i] = 0;\n",
+  "  for (i = 0; i < seeds; i++) parent[i] = TRBVH_NONE;\n",
+  "  for (i = 0; i < count; i++) {\n",
+  "    height[i] = 0;\n",
+  "    for (k = 0; k < 2; k++) {\n",
+  "      trbvh_u32 child = nodes[node[i]].first + k;\n",
+  "      if (trb_count(nodes[child].count) < smallest) continue;\n",
+  "      parent[count] = i;\n",
+  "      node[count++] = child;\n",
+  "    }\n",
+  "  }\n",
+  "  TRBVH_ASSERT(count <= room);\n",
+  "  for (i = count; i-- > 0;) {\n",
+  "    highest = TRB_MAX(height[i], highest);\n",
+  "    if (parent[i] != TRBVH_NONE) height[parent[i]] = TRB_MAX(height[i] + 1, height[parent[i]]);\n",
+  "  }\n",
+  "  for (i = 0; i <= highest + 1; i++) start[i] = 0;\n",
+  "  for (i = 0; i < count; i++) start[height[i] + 1]++;\n",
+  "  for (i = 0; i < highest; i++) start[i + 1] += start[i];\n",
+  "  for (i = 0; i < count; i++) sorted[start[height[i]]++] = node[i];\n",
+  "  for (i = 0, k = 0; k <= highest; k++)\n",
+  "    for (; i < start[k]; i += TRB_MIN(TRB_LANES, start[k] - i))\n",
+  "      trb_restructure(nodes, &t, sorted + i, TRB_MIN(TRB_LANES, start[k] - i), costs);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "typedef struct trb_group { trbvh_u32 first_ref, refs, seeds; } trb_group;\n",
+  "\n",
+  "\n",
+  "\n",
+  "TRB_SHARED trbvh_u32 trb_find_groups(const TRB_GLOBAL trbvh_node *nodes, TRB_GLOBAL trbvh_u32 *top,\n",
+  "                                     TRB_GLOBAL trbvh_u32 *lists, TRB_GLOBAL trb_group *groups, trbvh_u32 gamma) {\n",
+  "  const trbvh_u32 above = TRB_MAX(TRB_BLOCK + 1, gamma);\n",
+  "  trbvh_u32 top_count = 1, group_count = 0, first_ref = 0, i;\n",
+  "  trb_group group = {0, 0, 0};\n",
+  "  top[0] = 0;\n",
+  "  for (i = 0; i < top_count; i++) {\n",
+  "    const trbvh_node node = nodes[top[i]];\n",
+  "    trbvh_u32 count = trb_count(node.count);\n",
+  "    if (count >= above) {\n",
+  "      top[top_count++] = node.first;\n",
+  "      top[top_count++] = node.first + 1;\n",
+  "    } else if (count >= gamma) {\n",
+  "      if (group_count == 0 || group.refs >= TRB_BLOCK) {\n",
+  "        group_count++;\n",
+  "        group.first_ref = first_ref;\n",
+  "        group.refs = group.seeds = 0;\n",
+  "      }\n",
+  "      lists[4 * (size_t)group.first_ref + group.seeds++] = top[i];\n",
+  "      group.refs += count;\n",
+  "      first_ref += count;\n",
+  "      groups[group_count - 1] = group;\n",
+  "    }\n",
+  "  }\n",
+  "  return group_count;\n",
+  "}\n",
+  "\n",
+  "TRB_SHARED void trb_restructure_group(TRB_GLOBAL trbvh_node *nodes, TRB_GLOBAL trbvh_u32 *lists, trb_group group,\n",
+  "                                      trbvh_u32 gamma, trb_costs costs) {\n",
+  "  TRBVH_ASSERT(group.refs < 2 * TRB_BLOCK);\n",
+  "  trb_restructure_below(nodes, lists + 4 * (size_t)group.first_ref, group.refs, group.seeds, gamma, costs);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_restructure_top(TRB_GLOBAL trbvh_node *nodes, TRB_GLOBAL trbvh_u32 *lists, trbvh_u32 refs,\n",
+  "                                    trbvh_u32 gamma, trb_costs costs) {\n",
+  "  const trbvh_u32 above = TRB_MAX(TRB_BLOCK + 1, gamma);\n",
+  "  if (trb_count(nodes[0].count) < above) return;\n",
+  "  lists[0] = 0;\n",
+  "  trb_restructure_below(nodes, lists, refs, 1, above, costs);\n",
+  "}\n",
+  "#endif\n",
+  "#line 1305 \"trbvh.h\"\n",
+  "typedef struct trb_collapser {\n",
+  "  TRB_GLOBAL trbvh_node *nodes;\n",
+  "  TRB_GLOBAL trbvh_node *spare;\n",
+  "  TRB_GLOBAL trbvh_u32  *words[2];\n",
+  "  trb_costs costs;\n",
+  "  float     cost_node, cost_prim;\n",
+  "  trbvh_u32 split;\n",
+  "  TRB_GLOBAL trbvh_node *out;\n",
+  "  TRB_GLOBAL trbvh_u32  *prims;\n",
+  "} trb_collapser;\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_balance(const trb_collapser *c, trbvh_u32 node, trbvh_u32 first_ref) {\n",
+  "  const trbvh_u32 refs = trb_count(c->nodes[node].count);\n",
+  "  TRB_GLOBAL trbvh_node *leaf = c->spare + first_ref;\n",
+  "  TRB_GLOBAL trbvh_u32 *pair = c->words[0] + 2 * (size_t)first_ref, *root = pair + refs;\n",
+  "  TRB_GLOBAL trbvh_u32 *first = c->words[1] + 2 * (size_t)first_ref, *count = first + refs, *stack = first;\n",
+  "  trbvh_u32 leaves = 0, pairs = 0, inner = 1, waiting = 0, i, side;\n",
+  "  stack[waiting++] = node;\n",
+  "  while (waiting) {\n",
+  "    trbvh_node n = c->nodes[stack[--waiting]];\n",
+  "    if (trb_count(n.count) == 1) {\n",
+  "      leaf[leaves++] = n;\n",
+  "    } else {\n",
+  "      pair[pairs++] = n.first;\n",
+  "      stack[waiting++] = n.first + 1;\n",
+  "      stack[waiting++] = n.first;\n",
+  "    }\n",
+  "  }\n",
+  "  TRBVH_ASSERT(leaves == refs && pairs + 1 == refs);\n",
+  "  root[0] = node;\n",
+  "  first[0] = 0;\n",
+  "  count[0] = refs;\n",
+  "  for (i = 0; i < pairs; i++) {\n",
+  "    for (side = 0; side < 2; side++) {\n",
+  "      trbvh_u32 left = count[i] / 2, part = side ? count[i] - left : left, at = first[i] + (side ? left : 0);\n",
+  "      if (part == 1) {\n",
+  "        c->nodes[pair[i] + side] = leaf[at];\n",
+  "      } else {\n",
+  "        root[inner] = pair[i] + side;\n",
+  "        first[inner] = at;\n",
+  "        count[inner++] = part;\n",
+  "      }\n",
+  "    }\n",
+  "  }\n",
+  "  for (i = pairs; i-- > 0;) c->nodes[root[i]] = trb_parent(c->nodes[pair[i]], c->nodes[pair[i] + 1], pair[i], c->costs);\n",
+  "}\n",
+  "\n",
+  "TRB_CORE int trb_too_deep(trbvh_u32 depth, trbvh_u32 word) {\n",
+  "  trbvh_u32 count = trb_count(word);\n",
+  "  return count > 1 && depth + trb_log2(count - 1) + 1 > TRBVH_MAX_DEPTH;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "\n",
+  "TRB_CORE trbvh_node trb_bounded_node(const trb_collapser *c, trbvh_u32 i, trbvh_u32 depth, trbvh_u32 first_ref) {\n",
+  "  trbvh_node node = c->nodes[i];\n",
+  "  if (depth >= TRBVH_MAX_DEPTH / 2 && !trb_is_leaf(node.count) &&\n",
+  "      (trb_too_deep(depth + 1, c->nodes[node.first].count) || trb_too_deep(depth + 1, c->nodes[node.first + 1].count))) {\n",
+  "    trb_balance(c, i, first_ref);\n",
+  "    node = c->nodes[i];\n",
+  "  }\n",
+  "  return node;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_leaf_prims(const trb_collapser *c, trbvh_node leaf, trbvh_u32 prims[TRB_MAX_LEAF]) {\n",
+  "  trbvh_u32 stack[TRB_MAX_LEAF], waiting = 0, count = 0, i;\n",
+  "  for (;;) {\n",
+  "    if (trb_count(leaf.count) > 1) {\n",
+  "      stack[waiting++] = leaf.first;\n",
+  "      leaf = c->nodes[leaf.first + 1];\n",
+  "      continue;\n",
+  "    }\n",
+  "    for (i = 0; c->split && i < count && prims[i] != leaf.first; i++) {}\n",
+  "    if (!c->split || i == count) prims[count++] = leaf.first;\n",
+  "    if (waiting == 0) return count;\n",
+  "    leaf = c->nodes[stack[--waiting]];\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_count_prims(const trb_collapser *c, trbvh_node leaf) {\n",
+  "  trbvh_u32 prims[TRB_MAX_LEAF];\n",
+  "  return c->split ? trb_leaf_prims(c, leaf, prims) : trb_count(leaf.count);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE TRB_REAL trb_sah_term(trbvh_node node, TRB_REAL weight) {\n",
+  "  TRB_REAL x = (TRB_REAL)node.max[0] - node.min[0], y = (TRB_REAL)node.max[1] - node.min[1];\n",
+  "  TRB_REAL z = (TRB_REAL)node.max[2] - node.min[2];\n",
+  "  return weight * (x * y + z * (x + y));\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_emit_inner(const trb_collapser *c, trbvh_node node, trbvh_u32 dst, trbvh_u32 pair) {\n",
+  "  node.first = 2 * pair;\n",
+  "  node.count = 0;\n",
+  "  c->out[dst] = node;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_emit_leaf(const trb_collapser *c, trbvh_node node, trbvh_u32 dst, trbvh_u32 first) {\n",
+  "  trbvh_u32 prims[TRB_MAX_LEAF], i;\n",
+  "  node.count = trb_leaf_prims(c, node, prims);\n",
+  "  node.first = first;\n",
+  "  c->out[dst] = node;\n",
+  "  for (i = 0; i < node.count; i++) c->prims[first + i] = prims[i];\n",
+  "  return node.count;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "typedef struct trb_task {\n",
+  "  trbvh_u32 node, depth, first_ref;\n",
+  "  trbvh_u32 leaves, prims, max_depth;\n",
+  "  trbvh_u32 dst, pair, first_prim;\n",
+  "  TRB_REAL  sah;\n",
+  "} trb_task;\n",
+  "#define TRB_TASKS_MAX(refs) (TRBVH_MAX_DEPTH * ((refs) / TRB_BLOCK) + 1)\n",
+  "\n",
+  "\n",
+  "typedef struct trb_visit { trbvh_u32 first, pair, depth; } trb_visit;\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_count_task(const trb_collapser *c, TRB_GLOBAL trb_task *task) {\n",
+  "  const trbvh_u32 first_ref = task->first_ref;\n",
+  "  trbvh_u32 waiting = 0, child = task->node, siblings = 1, leaves = 0, prims = 0, max_depth = 0;\n",
+  "  TRB_REAL sah = 0;\n",
+  "  trb_visit stack[TRBVH_MAX_DEPTH + 1], v;\n",
+  "  v.depth = task->depth;\n",
+  "  for (;;) {\n",
+  "    for (; siblings; siblings--, child++) {\n",
+  "      const trbvh_node node = trb_bounded_node(c, child, v.depth, first_ref);\n",
+  "      if (trb_is_leaf(node.count)) {\n",
+  "        trbvh_u32 count = trb_count_prims(c, node);\n",
+  "        leaves++;\n",
+  "        prims += count;\n",
+  "        sah += trb_sah_term(node, (TRB_REAL)c->cost_prim * count);\n",
+  "        max_depth = TRB_MAX(v.depth, max_depth);\n",
+  "      } else {\n",
+  "        TRB_PREFETCH(&c->nodes[node.first]);\n",
+  "        sah += trb_sah_term(node, c->cost_node);\n",
+  "        stack[waiting].first = node.first;\n",
+  "        stack[waiting++].depth = v.depth + 1;\n",
+  "      }\n",
+  "    }\n",
+  "    if (waiting == 0) break;\n",
+  "    v = stack[--waiting];\n",
+  "    child = v.first;\n",
+  "    siblings = 2;\n",
+  "  }\n",
+  "  task->leaves = leaves;\n",
+  "  task->prims = prims;\n",
+  "  task->max_depth = max_depth;\n",
+  "  task->sah = sah;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED trbvh_u32 trb_find_tasks(const trb_collapser *c, TRB_GLOBAL trb_task *tasks, TRB_REAL *sah) {\n",
+  "  trbvh_u32 stack[TRBVH_MAX_DEPTH + 1], depths[TRBVH_MAX_DEPTH + 1], waiting = 0, refs = 0, node = 0, depth = 0, count = 0;\n",
+  "  *sah = 0;\n",
+  "  for (;;) {\n",
+  "    const trbvh_node n = trb_bounded_node(c, node, depth, refs);\n",
+  "    if (trb_count(n.count) > TRB_BLOCK) {\n",
+  "      *sah += trb_sah_term(n, c->cost_node);\n",
+  "      stack[waiting] = n.first + 1;\n",
+  "      depths[waiting++] = ++depth;\n",
+  "      node = n.first;\n",
+  "    } else {\n",
+  "      TRB_GLOBAL trb_task *task = &tasks[count++];\n",
+  "      task->node = node;\n",
+  "      task->depth = depth;\n",
+  "      task->first_ref = refs;\n",
+  "      refs += trb_count(n.count);\n",
+  "      if (waiting == 0) return count;\n",
+  "      node = stack[--waiting];\n",
+  "      depth = depths[waiting];\n",
+  "    }\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_emit_top(const trb_collapser *c, TRB_GLOBAL trb_task *task) {\n",
+  "  trbvh_u32 stack[TRBVH_MAX_DEPTH + 1], dsts[TRBVH_MAX_DEPTH + 1], waiting = 0, pair = 1, prim = 0, node = 0, dst = 0;\n",
+  "  for (;;) {\n",
+  "    const trbvh_node n = c->nodes[node];\n",
+  "    if (trb_count(n.count) > TRB_BLOCK) {\n",
+  "      trb_emit_inner(c, n, dst, pair);\n",
+  "      stack[waiting] = n.first + 1;\n",
+  "      dsts[waiting++] = 2 * pair + 1;\n",
+  "      node = n.first;\n",
+  "      dst = 2 * pair++;\n",
+  "    } else {\n",
+  "      task->dst = dst;\n",
+  "      task->pair = pair;\n",
+  "      task->first_prim = prim;\n",
+  "      pair += task->leaves - 1;\n",
+  "      prim += task++->prims;\n",
+  "      if (waiting == 0) return;\n",
+  "      node = stack[--waiting];\n",
+  "      dst = dsts[waiting];\n",
+  "    }\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_emit_task(const trb_collapser *c, trb_task task) {\n",
+  "  trbvh_u32 waiting = 0, pair = task.pair, prim = task.first_prim, child = task.node, dst = task.dst, siblings = 1;\n",
+  "  trb_visit stack[TRBVH_MAX_DEPTH + 1], v;\n",
+  "  for (;;) {\n",
+  "    for (; siblings; siblings--, child++, dst++) {\n",
+  "      const trbvh_node node = c->nodes[child];\n",
+  "      if (trb_is_leaf(node.count)) {\n",
+  "        prim += trb_emit_leaf(c, node, dst, prim);\n",
+  "      } else {\n",
+  "        trb_emit_inner(c, node, dst, pair);\n",
+  "        TRB_PREFETCH(&c->nodes[node.first]);\n",
+  "        stack[waiting].first = node.first;\n",
+  "        stack[waiting++].pair = pair++;\n",
+  "      }\n",
+  "    }\n",
+  "    if (waiting == 0) break;\n",
+  "    v = stack[--waiting];\n",
+  "    child = v.first;\n",
+  "    dst = 2 * v.pair;\n",
+  "    siblings = 2;\n",
+  "  }\n",
+  "  TRBVH_ASSERT(pair - task.pair == task.leaves - 1 && prim - task.first_prim == task.prims);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_make_triangle(const trb_mesh *mesh, trbvh_u32 prim, TRB_GLOBAL trbvh_triangle *out) {\n",
+  "  float v[3][3];\n",
+  "  trbvh_u32 inexact = 0, vertex;\n",
+  "  int k;\n",
+  "  trb_load_triangle(mesh, prim, v, &vertex);\n",
+  "  for (k = 0; k < 3; k++) {\n",
+  "    float e1 = v[1][k] - v[0][k], e2 = v[2][k] - v[0][k];\n",
+  "    out->v0[k] = v[0][k];\n",
+  "    out->e1[k] = e1;\n",
+  "    out->e2[k] = e2;\n",
+  "    inexact |= (v[0][k] + e1 != v[1][k]) | (v[0][k] + e2 != v[2][k]);\n",
+  "  }\n",
+  "  out->prim = prim;\n",
+  "  out->reserved0 = inexact;\n",
+  "  out->reserved1 = 0;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_make_triangles(const trb_mesh *mesh, const TRB_GLOBAL trbvh_u32 *prims, trbvh_u32 first, trbvh_u32 end,\n",
+  "                                   TRB_GLOBAL trbvh_triangle *out) {\n",
+  "  trbvh_u32 i;\n",
+  "  for (i = first; i < end; i++) {\n",
+  "    if (i + 3 * TRB_AHEAD < end) {\n",
+  "      trb_prefetch_indices(mesh, prims[i + 3 * TRB_AHEAD]);\n",
+  "      trb_prefetch_positions(mesh, prims[i + TRB_AHEAD]);\n",
+  "    }\n",
+  "    trb_make_triangle(mesh, prims[i], &out[i]);\n",
+  "  }\n",
+  "}\n",
+  "#line 1575 \"trbvh.h\"\n",
+  "#define TRB_UNIT 5.9604645e-8f\n",
+  "#define TRB_ABS(x) ((x) < 0 ? -(x) : (x))\n",
+  "typedef struct trb_ray {\n",
+  "  float    origin[3], inverse[3], tmin, tmax;\n",
+  "  float    t_unit;\n",
+  "  float    near_origin[3], far_origin[3];\n",
+  "  TRB_REAL shear[3];\n",
+  "  int      near_corner[3], far_corner[3], axis[3];\n",
+  "} trb_ray;\n",
+  "\n",
+  "\n",
+  "\n",
+  "TRB_CORE int trb_prepare_ray(trb_ray *r, const trbvh_ray *ray, const TRB_GLOBAL float *scene) {\n",
+  "  float x = trb_abs(ray->dir[0]), y = trb_abs(ray->dir[1]), z = trb_abs(ray->dir[2]), extent = 0, dir[3];\n",
+  "  int k, finite = 1;\n",
+  "  r->t_unit = x + y + z < 8.6736174e-19f ? 1.1529215e18f : 1.0f;\n",
+  "  for (k = 0; k < 3; k++) {\n",
+  "    float low = trb_abs(scene[k] - ray->origin[k]), high = trb_abs(scene[k + 4] - ray->origin[k]);\n",
+  "    low = TRB_MAX(low, high);\n",
+  "    extent = TRB_MAX(low, extent);\n",
+  "    dir[k] = ray->dir[k] * r->t_unit;\n",
+  "  }\n",
+  "  for (k = 0; k < 3; k++) {\n",
+  "    int negative = (int)(trb_bits(dir[k]) >> 31);\n",
+  "    float pad = (negative ? -64.0f : 64.0f) * TRB_UNIT * extent;\n",
+  "    finite &= trb_finite(ray->origin[k]) & trb_finite(dir[k]);\n",
+  "    r->origin[k] = ray->origin[k];\n",
+  "    r->near_origin[k] = ray->origin[k] + pad;\n",
+  "    r->far_origin[k] = ray->origin[k] - pad;\n",
+  "    r->inverse[k] = dir[k] != 0 ? 1.0f / dir[k] : trb_float(negative ? 0xFF800000u : 0x7F800000u);\n",
+  "    r->near_corner[k] = negative ? k + 4 : k;\n",
+  "    r->far_corner[k] = negative ? k : k + 4;\n",
+  "  }\n",
+  "  r->axis[2] = x >= y ? (x >= z ? 0 : 2) : (y >= z ? 1 : 2);\n",
+  "  r->axis[0] = r->axis[2] == 2 ? 0 : r->axis[2] + 1;\n",
+  "  r->axis[1] = r->axis[0] == 2 ? 0 : r->axis[0] + 1;\n",
+  "  r->shear[2] = 1 / (TRB_REAL)dir[r->axis[2]];\n",
+  "  r->shear[0] = dir[r->axis[0]] * r->shear[2];\n",
+  "  r->shear[1] = dir[r->axis[1]] * r->shear[2];\n",
+  "  r->tmin = TRB_MAX(ray->tmin, 0.0f) / r->t_unit;\n",
+  "  r->tmax = (ray->tmax == 0 ? FLT_MAX : TRB_MIN(ray->tmax, FLT_MAX)) / r->t_unit;\n",
+  "  return finite && x + y + z > 0 && ray->tmin == ray->tmin && ray->tmax == ray->tmax && r->tmin < r->tmax;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "\n",
+  "TRB_CORE float trb_hit_box(const TRB_GLOBAL float *box, const trb_ray *r, float limit) {\n",
+  "  float near0 = (box[r->near_corner[0]] - r->near_origin[0]) * r->inverse[0];\n",
+  "  float near1 = (box[r->near_corner[1]] - r->near_origin[1]) * r->inverse[1];\n",
+  "  float near2 = (box[r->near_corner[2]] - r->near_origin[2]) * r->inverse[2];\n",
+  "  float far0 = (box[r->far_corner[0]] - r->far_origin[0]) * r->inverse[0];\n",
+  "  float far1 = (box[r->far_corner[1]] - r->far_origin[1]) * r->inverse[1];\n",
+  "  float far2 = (box[r->far_corner[2]] - r->far_origin[2]) * r->inverse[2];\n",
+  "  float enter = r->tmin, leave = limit;\n",
+  "  enter = TRB_MAX(near0, enter); leave = TRB_MIN(far0, leave);\n",
+  "  enter = TRB_MAX(near1, enter); leave = TRB_MIN(far1, leave);\n",
+  "  enter = TRB_MAX(near2, enter); leave = TRB_MIN(far2, leave);\n",
+  "  return enter <= leave ? enter : -1.0f;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "typedef struct trb_corner { TRB_REAL x, y, z; } trb_corner;\n",
+  "\n",
+  "TRB_CORE trb_corner trb_see(float x, float y, float z, const trb_ray *r) {\n",
+  "  trb_corner c;\n",
+  "  c.z = (TRB_REAL)z - r->origin[r->axis[2]];\n",
+  "  c.x = (TRB_REAL)x - r->origin[r->axis[0]] - r->shear[0] * c.z;\n",
+  "  c.y = (TRB_REAL)y - r->origin[r->axis[1]] - r->shear[1] * c.z;\n",
+  "  return c;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE TRB_REAL trb_along(trb_corner a, trb_corner b) {\n",
+  "  TRB_REAL x = a.x - b.x, y = a.y - b.y, along = (a.x * x + a.y * y) / (x * x + y * y);\n",
+  "  along = TRB_MIN(along, 1);\n",
+  "  return TRB_MAX(along, 0);\n",
+  "}\n",
+  "#line 1659 \"trbvh.h\"\n",
+  "TRB_CORE int trb_hit_triangle(const TRB_GLOBAL trbvh_triangle *t, const trb_ray *r, float tmax, trbvh_hit *hit) {\n",
+  "  const int x = r->axis[0], y = r->axis[1], z = r->axis[2];\n",
+  "  const trb_corner a = trb_see(t->v0[x], t->v0[y], t->v0[z], r);\n",
+  "  const trb_corner b = trb_see(t->v0[x] + t->e1[x], t->v0[y] + t->e1[y], t->v0[z] + t->e1[z], r);\n",
+  "  const trb_corner c = trb_see(t->v0[x] + t->e2[x], t->v0[y] + t->e2[y], t->v0[z] + t->e2[z], r);\n",
+  "  TRB_REAL u = c.x * b.y - c.y * b.x, v = a.x * c.y - a.y * c.x, w = b.x * a.y - b.y * a.x, area = u + v + w;\n",
+  "  float distance;\n",
+  "  if (area < 0) { u = -u; v = -v; w = -w; area = -area; }\n",
+  "  if (!(area > 0)) return 0;\n",
+  "  if (!(u >= 0 && v >= 0 && w >= 0)) {\n",
+  "    float off = 0;\n",
+  "    int k;\n",
+  "    if (!t->reserved0) return 0;\n",
+  "    if (u <= v && u <= w) { u = 0; w = trb_along(b, c); v = 1 - w; }\n",
+  "    else if (v <= w)      { v = 0; u = trb_along(c, a); w = 1 - u; }\n",
+  "    else                  { w = 0; v = trb_along(a, b); u = 1 - v; }\n",
+  "    area = 1;\n",
+  "    for (k = 0; k < 3; k++) {\n",
+  "      off = TRB_MAX(trb_abs(t->e1[k]), off);\n",
+  "      off = TRB_MAX(trb_abs(t->e2[k]), off);\n",
+  "    }\n",
+  "    off *= 4 * TRB_UNIT;\n",
+  "    if (!(TRB_ABS(u * a.x + v * b.x + w * c.x) <= off && TRB_ABS(u * a.y + v * b.y + w * c.y) <= off)) return 0;\n",
+  "  } else {\n",
+  "    TRB_REAL width = TRB_ABS(a.x) + TRB_ABS(b.x) + TRB_ABS(c.x), height = TRB_ABS(a.y) + TRB_ABS(b.y) + TRB_ABS(c.y);\n",
+  "    if (!(area > TRB_NOISE * width * height)) return 0;\n",
+  "  }\n",
+  "  distance = (float)((u * a.z + v * b.z + w * c.z) / area * r->shear[2]);\n",
+  "  if (!(distance > r->tmin && distance <= tmax)) return 0;\n",
+  "  hit->t = distance;\n",
+  "  hit->u = (float)(v / area);\n",
+  "  hit->v = (float)(w / area);\n",
+  "  return 1;\n",
+  "}\n",
+  "\n",
+  "TRB_CORE void trb_miss(const trb_ray *r, trbvh_hit *hit) {\n",
+  "  hit->t = r->tmax * r->t_unit;\n",
+  "  hit->u = hit->v = 0;\n",
+  "  hit->prim = hit->instance = TRBVH_NONE;\n",
+  "}\n",
+  "#line 1703 \"trbvh.h\"\n",
+  "TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbvh_triangle *triangles,\n",
+  "                       const trb_ray *r, int any, trbvh_hit *hit) {\n",
+  "  trbvh_u32 stack_node[TRBVH_MAX_DEPTH], height = 0, node = 0, i;\n",
+  "  float     stack_near[TRBVH_MAX_DEPTH];\n",
+  "  trb_miss(r, hit);\n",
+  "  if (trb_hit_box((const TRB_GLOBAL float *)&nodes[0], r, r->tmax) < 0) return 0;\n",
+  "  hit->t = r->tmax;\n",
+  "  for (;;) {\n",
+  "    const trbvh_u32 first = nodes[node].first, count = nodes[node].count;\n",
+  "    if (count == 0) {\n",
+  "      float left = trb_hit_box((const TRB_GLOBAL float *)&nodes[first], r, hit->t);\n",
+  "      float right = trb_hit_box((const TRB_GLOBAL float *)&nodes[first + 1], r, hit->t);\n",
+  "      if (left >= 0 && right >= 0) {\n",
+  "        trbvh_u32 swap = right < left;\n",
+  "        stack_node[height] = first + 1 - swap;\n",
+  "        stack_near[height++] = swap ? left : right;\n",
+  "        node = first + swap;\n",
+  "        continue;\n",
+  "      }\n",
+  "      if (left >= 0 || right >= 0) {\n",
+  "        node = left >= 0 ? first : first + 1;\n",
+  "        continue;\n",
+  "      }\n",
+  "    }\n",
+  "    for (i = first; i < first + count; i++) {\n",
+  "      trbvh_hit found;\n",
+  "      if (!trb_hit_triangle(&triangles[i], r, hit->t, &found)) continue;\n",
+  "      if (any) return 1;\n",
+  "      if (found.t < hit->t || triangles[i].prim < hit->prim) {\n",
+  "        hit->t = found.t;\n",
+  "        hit->u = found.u;\n",
+  "        hit->v = found.v;\n",
+  "        hit->prim = triangles[i].prim;\n",
+  "      }\n",
+  "    }\n",
+  "    do {\n",
+  "      if (height == 0) {\n",
+  "        hit->t *= r->t_unit;\n",
+  "        return hit->prim != TRBVH_NONE;\n",
+  "      }\n",
+  "      node = stack_node[--height];\n",
+  "    } while (stack_near[height] > hit->t);\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "\n",
+  "#define TRB_GPU_GROUP   256u\n",
+  "#define TRB_GPU_TILE    2048u\n",
+  "#define TRB_GPU_CHUNK   1024u\n",
+  "#define TRB_GPU_CHUNKS  16u\n",
+  "#define TRB_GPU_LEVELS  128u\n",
+  "#define TRB_CANDIDATES  16u\n",
+  "\n",
+  "\n",
+  "typedef struct trb_plan {\n",
+  "  trb_u64      position_offset, position_stride, index_offset;\n",
+  "  trb_u64      scale;\n",
+  "  trb_costs    costs;\n",
+  "  trb_key_form form;\n",
+  "  float        cost_node, cost_prim;\n",
+  "  trbvh_u32    prim_count, position_count, index_size, boxes, split_max;\n",
+  "\n",
+  "  trb_grid     grid;\n",
+  "  float        priority_unit;\n",
+  "  float        sah, root_area;\n",
+  "  trbvh_u32    scale_low, slots, ref_count;\n",
+  "  trbvh_u32    skipped, bad, bad_vertex;\n",
+  "  trbvh_u32    groups, tasks, leaves, prims, max_depth;\n",
+  "} trb_plan;\n",
+  "\n",
+  "\n",
+  "typedef struct trb_partial {\n",
+  "  trbvh_node bounds;\n",
+  "  trbvh_u32  skipped, bad, bad_vertex;\n",
+  "  float      priority;\n",
+  "} trb_partial;\n",
+  "\n",
+  "\n",
+  "\n",
+  "typedef struct trb_wait { trbvh_u32 first, last; } trb_wait;\n",
+  "\n",
+  "\n",
+  "typedef struct trb_level { trbvh_u32 first, count; } trb_level;\n",
+  "\n",
+  "\n",
+  "\n",
+  "typedef struct trb_place {\n",
+  "  trbvh_u32 inner, prims;\n",
+  "  float     sah;\n",
+  "  trbvh_u32 pair, next, prim;\n",
+  "} trb_place;\n",
+  "#line 6 \"kernels/query.cl\"\n",
+  "static inline __attribute__((unused)) int trbvh_intersect(const __global trbvh_node *nodes,\n",
+  "                                                          const __global trbvh_triangle *triangles, trbvh_ray ray,\n",
+  "                                                          trbvh_hit *hit) {\n",
+  "  trb_ray r;\n",
+  "  if (trb_prepare_ray(&r, &ray, (const __global float *)nodes)) return trb_trace(nodes, triangles, &r, 0, hit);\n",
+  "  trb_miss(&r, hit);\n",
+  "  return 0;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "static inline __attribute__((unused)) int trbvh_occluded(const __global trbvh_node *nodes,\n",
+  "                                                         const __global trbvh_triangle *triangles, trbvh_ray ray) {\n",
+  "  trb_ray r;\n",
+  "  trbvh_hit hit;\n",
+  "  return trb_prepare_ray(&r, &ray, (const __global float *)nodes) && trb_trace(nodes, triangles, &r, 1, &hit);\n",
+  "}\n",
+  "#ifdef TRB_WITH_SHAPE\n",
+  "#line 9 \"kernels/shape.cl\"\n",
+  "#ifdef TRB_CPU\n",
+  "  #define TRB_GROUP 1u\n",
+  "  #define TRB_TILE  TRB_BLOCK\n",
+  "  #define TRB_SYNC() ((void)0)\n",
+  "#else\n",
+  "  #define TRB_GROUP TRB_GPU_GROUP\n",
+  "  #define TRB_TILE  TRB_GPU_TILE\n",
+  "  #define TRB_SYNC() barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE)\n",
+  "#endif\n",
+  "#define TRB_KERNEL    __kernel __attribute__((reqd_work_group_size(TRB_GROUP, 1, 1))) void\n",
+  "#define TRB_GROUP_ID  ((uint)get_group_id(0))\n",
+  "#define TRB_LOCAL_ID  ((uint)get_local_id(0))\n",
+  "\n",
+  "\n",
+  "#ifdef TRB_CPU\n",
+  "  #define TRB_FOR(i, n) for (i = TRB_GROUP_ID * TRB_BLOCK; i < (n) && i < (TRB_GROUP_ID + 1) * TRB_BLOCK; i++)\n",
+  "#else\n",
+  "  #define TRB_FOR(i, n) for (i = (uint)get_global_id(0); i < (n); i += (uint)get_global_size(0))\n",
+  "#endif\n",
+  "\n",
+  "static uint trb_scan(uint value, __local uint *space, uint *total) {\n",
+  "#ifdef TRB_CPU\n",
+  "  *total = value;\n",
+  "  return 0;\n",
+  "#else\n",
+  "  const uint id = TRB_LOCAL_ID;\n",
+  "  uint sum = value, step;\n",
+  "  TRB_SYNC();\n",
+  "  space[id] = value;\n",
+  "  for (step = 1; step < TRB_GROUP; step *= 2) {\n",
+  "    uint before;\n",
+  "    TRB_SYNC();\n",
+  "    before = id >= step ? space[id - step] : 0;\n",
+  "    TRB_SYNC();\n",
+  "    sum += before;\n",
+  "    space[id] = sum;\n",
+  "  }\n",
+  "  TRB_SYNC();\n",
+  "  *total = space[TRB_GROUP - 1];\n",
+  "  return sum - value;\n",
+  "#endif\n",
+  "}\n",
+  "\n",
+  "\n",
+  "static trb_mesh trb_plan_mesh(const __global trb_plan *plan, const __global char *positions, const __global char *indices) {\n",
+  "  trb_mesh mesh;\n",
+  "  mesh.positions = plan->boxes ? 0 : positions + plan->position_offset;\n",
+  "  mesh.boxes = plan->boxes ? positions + plan->position_offset : 0;\n",
+  "  mesh.indices = plan->index_size ? indices + plan->index_offset : 0;\n",
+  "  mesh.position_stride = mesh.box_stride = plan->position_stride;\n",
+  "  mesh.position_count = plan->position_count;\n",
+  "  mesh.index_size = plan->index_size;\n",
+  "  mesh.count = plan->prim_count;\n",
+  "  return mesh;\n",
+  "}\n",
+  "#line 70 \"kernels/shape.cl\"\n",
+  "static uint trb_reserve(volatile __global uint *end, uint count, __local uint *space) {\n",
+  "#ifdef TRB_CPU\n",
+  "  return count ? atomic_add(end, count) : 0;\n",
+  "#else\n",
+  "  uint at;\n",
+  "  TRB_SYNC();\n",
+  "  if (TRB_LOCAL_ID == 0) space[0] = 0;\n",
+  "  TRB_SYNC();\n",
+  "  at = count ? atomic_add((volatile __local uint *)&space[0], count) : 0;\n",
+  "  TRB_SYNC();\n",
+  "  if (TRB_LOCAL_ID == 0) space[1] = atomic_add(end, space[0]);\n",
+  "  TRB_SYNC();\n",
+  "  return at + space[1];\n",
+  "#endif\n",
+  "}\n",
+  "#endif\n",
+  "#ifdef TRB_WITH_BOUNDS\n",
+  "#line 4 \"kernels/bounds.cl\"\n",
+  "static void trb_merge(trb_partial *into, trb_partial p) {\n",
+  "  trb_include(&into->bounds, p.bounds.min, p.bounds.max);\n",
+  "  into->skipped += p.skipped;\n",
+  "  into->priority = TRB_MAX(p.priority, into->priority);\n",
+  "  if (p.bad < into->bad) { into->bad = p.bad; into->bad_vertex = p.bad_vertex; }\n",
+  "}\n",
+  "\n",
+  "static trb_partial trb_nothing(void) {\n",
+  "  trb_partial p;\n",
+  "  p.bounds = trb_no_box();\n",
+  "  p.skipped = p.bad_vertex = 0;\n",
+  "  p.bad = TRBVH_NONE;\n",
+  "  p.priority = 0;\n",
+  "  return p;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "static trb_partial trb_merge_group(trb_partial mine, __local trb_partial *space) {\n",
+  "#ifndef TRB_CPU\n",
+  "  uint half_size;\n",
+  "  for (half_size = TRB_GROUP / 2; half_size; half_size /= 2) {\n",
+  "    TRB_SYNC();\n",
+  "    if (TRB_LOCAL_ID >= half_size && TRB_LOCAL_ID < 2 * half_size) space[TRB_LOCAL_ID - half_size] = mine;\n",
+  "    TRB_SYNC();\n",
+  "    if (TRB_LOCAL_ID < half_size) trb_merge(&mine, space[TRB_LOCAL_ID]);\n",
+  "  }\n",
+  "#endif\n",
+  "  return mine;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_read(__global trb_plan *plan, const __global char *positions, const __global char *indices,\n",
+  "                      __global trbvh_node *refs, __global trb_partial *partials) {\n",
+  "  __local trb_partial space[TRB_GROUP];\n",
+  "  const trb_mesh mesh = trb_plan_mesh(plan, positions, indices);\n",
+  "  trb_partial sum = trb_nothing();\n",
+  "  uint i;\n",
+  "  TRB_FOR(i, mesh.count) {\n",
+  "    trbvh_node box;\n",
+  "    float v[3][3];\n",
+  "    uint vertex;\n",
+  "    int valid = trb_prim_box(&mesh, i, &box, v, &vertex);\n",
+  "    box.first = i;\n",
+  "    if (valid > 0) {\n",
+  "      trb_include(&sum.bounds, box.min, box.max);\n",
+  "    } else {\n",
+  "      box = trb_no_box();\n",
+  "      box.first = TRBVH_NONE;\n",
+  "      sum.skipped++;\n",
+  "      if (valid < 0 && i < sum.bad) { sum.bad = i; sum.bad_vertex = vertex; }\n",
+  "    }\n",
+  "    refs[i] = box;\n",
+  "  }\n",
+  "  sum = trb_merge_group(sum, space);\n",
+  "  if (TRB_LOCAL_ID == 0) partials[TRB_GROUP_ID] = sum;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_grid(__global trb_plan *plan, const __global trb_partial *partials, uint count) {\n",
+  "  __local trb_partial space[TRB_GROUP];\n",
+  "  trb_partial sum = trb_nothing();\n",
+  "  uint i;\n",
+  "  for (i = TRB_LOCAL_ID; i < count; i += TRB_GROUP) trb_merge(&sum, partials[i]);\n",
+  "  sum = trb_merge_group(sum, space);\n",
+  "  if (TRB_LOCAL_ID != 0) return;\n",
+  "  plan->grid = trb_make_grid(sum.bounds);\n",
+  "  plan->skipped = sum.skipped;\n",
+  "  plan->bad = sum.bad;\n",
+  "  plan->bad_vertex = sum.bad_vertex;\n",
+  "  plan->slots = plan->prim_count;\n",
+  "  plan->ref_count = plan->prim_count - sum.skipped;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "static bool trb_has_gaps(const __global trb_plan *plan) { return plan->ref_count != plan->slots; }\n",
+  "\n",
+  "TRB_KERNEL trb_k_count_refs(const __global trb_plan *plan, const __global trbvh_node *refs, __global uint *counts) {\n",
+  "  __local uint space[TRB_GROUP];\n",
+  "  const uint first = TRB_GROUP_ID * TRB_TILE, end = min(plan->slots, first + TRB_TILE);\n",
+  "  uint i, count = 0, total;\n",
+  "  if (!trb_has_gaps(plan)) return;\n",
+  "  for (i = first + TRB_LOCAL_ID; i < end; i += TRB_GROUP) count += refs[i].first != TRBVH_NONE;\n",
+  "  trb_scan(count, space, &total);\n",
+  "  if (TRB_LOCAL_ID == 0) counts[TRB_GROUP_ID] = total;\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_move_refs(const __global trb_plan *plan, const __global trbvh_node *refs, const __global uint *starts,\n",
+  "                           __global trbvh_node *moved) {\n",
+  "  __local uint space[TRB_GROUP];\n",
+  "  const uint first = TRB_GROUP_ID * TRB_TILE, end = min(plan->slots, first + TRB_TILE);\n",
+  "  uint i, start = starts[TRB_GROUP_ID], total;\n",
+  "  if (!trb_has_gaps(plan)) return;\n",
+  "  for (i = first; i < end; i += TRB_GROUP) {\n",
+  "    const uint mine = i + TRB_LOCAL_ID;\n",
+  "    const bool valid = mine < end && refs[mine].first != TRBVH_NONE;\n",
+  "    const uint before = trb_scan(valid, space, &total);\n",
+  "    if (valid) moved[start + before] = refs[mine];\n",
+  "    start += total;\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_return_refs(const __global trb_plan *plan, const __global trbvh_node *moved, __global trbvh_node *refs) {\n",
+  "  uint i;\n",
+  "  if (!trb_has_gaps(plan)) return;\n",
+  "  TRB_FOR(i, plan->ref_count) refs[i] = moved[i];\n",
+  "}\n",
+  "\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_scan(__global uint *values, uint count) {\n",
+  "  __local uint space[TRB_GROUP];\n",
+  "  uint i, start = 0, total;\n",
+  "  for (i = 0; i < count; i += TRB_GROUP) {\n",
+  "    const uint mine = i + TRB_LOCAL_ID, value = mine < count ? values[mine] : 0;\n",
+  "    const uint before = trb_scan(value, space, &total);\n",
+  "    if (mine < count) values[mine] = start + before;\n",
+  "    start += total;\n",
+  "  }\n",
+  "}\n",
+  "#endif\n",
+  "#ifdef TRB_WITH_SPLIT\n",
+  "#line 4 \"kernels/split.cl\"\n",
+  "TRB_KERNEL trb_k_priorities(const __global trb_plan *plan, const __global char *positions, const __global char *indices,\n",
+  "                            const __global trbvh_node *refs, __global float *priorities,\n",
+  "                            __global trb_partial *partials) {\n",
+  "  __local trb_partial space[TRB_GROUP];\n",
+  "  const trb_mesh mesh = trb_plan_mesh(plan, positions, indices);\n",
+  "  const trb_grid grid = plan->grid;\n",
+  "  trb_partial sum = trb_nothing();\n",
+  "  uint i;\n",
+  "  TRB_FOR(i, mesh.count) {\n",
+  "    const trbvh_node box = refs[i];\n",
+  "    float v[3][3], priority = 0;\n",
+  "    uint vertex;\n",
+  "    if (box.first != TRBVH_NONE && trb_load_triangle(&mesh, i, v, &vertex))\n",
+  "      priority = trb_split_priority((const float (*)[3])v, box, grid);\n",
+  "    priorities[i] = priority;\n",
+  "    sum.priority = TRB_MAX(priority, sum.priority);\n",
+  "  }\n",
+  "  sum = trb_merge_group(sum, space);\n",
+  "  if (TRB_LOCAL_ID == 0) partials[TRB_GROUP_ID] = sum;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_priority_unit(__global trb_plan *plan, const __global trb_partial *partials, uint count) {\n",
+  "  __local trb_partial space[TRB_GROUP];\n",
+  "  trb_partial sum = trb_nothing();\n",
+  "  uint i;\n",
+  "  for (i = TRB_LOCAL_ID; i < count; i += TRB_GROUP) trb_merge(&sum, partials[i]);\n",
+  "  sum = trb_merge_group(sum, space);\n",
+  "  if (TRB_LOCAL_ID != 0) return;\n",
+  "  plan->priority_unit = trb_priority_unit(sum.priority);\n",
+  "  plan->scale_low = 0;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "static ulong trb_sum_group(ulong mine, __local ulong *space) {\n",
+  "#ifndef TRB_CPU\n",
+  "  uint half_size;\n",
+  "  for (half_size = TRB_GROUP / 2; half_size; half_size /= 2) {\n",
+  "    TRB_SYNC();\n",
+  "    if (TRB_LOCAL_ID >= half_size && TRB_LOCAL_ID < 2 * half_size) space[TRB_LOCAL_ID - half_size] = mine;\n",
+  "    TRB_SYNC();\n",
+  "    if (TRB_LOCAL_ID < half_size) mine += space[TRB_LOCAL_ID];\n",
+  "  }\n",
+  "#endif\n",
+  "  return mine;\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_sum_splits(const __global trb_plan *plan, const __global float *priorities, __global ulong *sums, uint step) {\n",
+  "  __local ulong space[TRB_GROUP];\n",
+  "  const float unit = plan->priority_unit;\n",
+  "  const uint low = plan->scale_low;\n",
+  "  ulong scale[TRB_CANDIDATES], sum[TRB_CANDIDATES];\n",
+  "  uint i, k;\n",
+  "  for (k = 0; k < TRB_CANDIDATES; k++) {\n",
+  "    scale[k] = trb_scale(min(low + k * step, TRB_SCALES - 1));\n",
+  "    sum[k] = 0;\n",
+  "  }\n",
+  "  TRB_FOR(i, plan->prim_count) {\n",
+  "    const float priority = priorities[i];\n",
+  "    for (k = 0; k < TRB_CANDIDATES; k++) sum[k] += trb_splits(priority, unit, scale[k]);\n",
+  "  }\n",
+  "  for (k = 0; k < TRB_CANDIDATES; k++) {\n",
+  "    ulong total = trb_sum_group(sum[k], space);\n",
+  "    if (TRB_LOCAL_ID == 0) sums[TRB_GROUP_ID * TRB_CANDIDATES + k] = total;\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_choose_scale(__global trb_plan *plan, const __global ulong *sums, uint step, uint count) {\n",
+  "  __local ulong space[TRB_GROUP];\n",
+  "  uint i, k, low = plan->scale_low;\n",
+  "  for (k = 1; k < TRB_CANDIDATES; k++) {\n",
+  "    ulong sum = 0;\n",
+  "    for (i = TRB_LOCAL_ID; i < count; i += TRB_GROUP) sum += sums[i * TRB_CANDIDATES + k];\n",
+  "    sum = trb_sum_group(sum, space);\n",
+  "    if (sum <= plan->split_max && plan->scale_low + k * step < TRB_SCALES) low = plan->scale_low + k * step;\n",
+  "  }\n",
+  "  TRB_SYNC();\n",
+  "  if (TRB_LOCAL_ID != 0) return;\n",
+  "  plan->scale_low = low;\n",
+  "  plan->scale = trb_scale(low);\n",
+  "}\n",
+  "\n",
+  "static uint trb_slots(const __global trb_plan *plan, const __global trbvh_node *refs, const __global float *priorities, uint i) {\n",
+  "  return refs[i].first == TRBVH_NONE ? 0 : (uint)trb_splits(priorities[i], plan->priority_unit, plan->scale) + 1;\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_count_slots(const __global trb_plan *plan, const __global trbvh_node *refs, const __global float *priorities,\n",
+  "                             __global uint *counts) {\n",
+  "  __local uint space[TRB_GROUP];\n",
+  "  const uint first = TRB_GROUP_ID * TRB_TILE, end = min(plan->prim_count, first + TRB_TILE);\n",
+  "  uint i, count = 0, total;\n",
+  "  for (i = first + TRB_LOCAL_ID; i < end; i += TRB_GROUP) count += trb_slots(plan, refs, priorities, i);\n",
+  "  trb_scan(count, space, &total);\n",
+  "  if (TRB_LOCAL_ID == 0) counts[TRB_GROUP_ID] = total;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_split(const __global trb_plan *plan, const __global char *positions, const __global char *indices,\n",
+  "                       const __global trbvh_node *refs, const __global float *priorities, const __global uint *starts,\n",
+  "                       __global trbvh_node *out, __global uint *found) {\n",
+  "  __local uint space[TRB_GROUP];\n",
+  "  const trb_mesh mesh = trb_plan_mesh(plan, positions, indices);\n",
+  "  const trb_grid grid = plan->grid;\n",
+  "  const uint first = TRB_GROUP_ID * TRB_TILE, end = min(plan->prim_count, first + TRB_TILE);\n",
+  "  uint i, k, start = starts[TRB_GROUP_ID], total, sum = 0;\n",
+  "  for (i = first; i < end; i += TRB_GROUP) {\n",
+  "    const uint mine = i + TRB_LOCAL_ID, slots = mine < end ? trb_slots(plan, refs, priorities, mine) : 0;\n",
+  "    const uint at = start + trb_scan(slots, space, &total);\n",
+  "    uint count = slots ? trb_split_reference(&mesh, grid, refs[mine], slots - 1, out + at) : 0;\n",
+  "    for (k = count; k < slots; k++) out[at + k].first = TRBVH_NONE;\n",
+  "    sum += count;\n",
+  "    start += total;\n",
+  "  }\n",
+  "  trb_scan(sum, space, &total);\n",
+  "  if (TRB_LOCAL_ID == 0) {\n",
+  "    found[2 * TRB_GROUP_ID] = total;\n",
+  "    found[2 * TRB_GROUP_ID + 1] = start;\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_sum_refs(__global trb_plan *plan, const __global uint *found, uint count) {\n",
+  "  __local uint space[TRB_GROUP];\n",
+  "  uint i, sum = 0, total;\n",
+  "  for (i = TRB_LOCAL_ID; i < count; i += TRB_GROUP) sum += found[2 * i];\n",
+  "  trb_scan(sum, space, &total);\n",
+  "  if (TRB_LOCAL_ID != 0) return;\n",
+  "  plan->slots = found[2 * count - 1];\n",
+  "  plan->ref_count = total;\n",
+  "}\n",
+  "#endif\n",
+  "#ifdef TRB_WITH_MORTON\n",
+  "#line 5 \"kernels/morton.cl\"\n",
+  "TRB_KERNEL trb_k_keys(const __global trb_plan *plan, const __global trbvh_node *refs, __global ulong *keys, uint high) {\n",
+  "  const trb_grid grid = plan->grid;\n",
+  "  const trb_key_form form = plan->form;\n",
+  "  const uint count = plan->ref_count;\n",
+  "  uint i;\n",
+  "  TRB_FOR(i, count) {\n",
+  "    const uint ref = high ? trb_key_ref(keys[i], form) : i;\n",
+  "    keys[i] = trb_key(refs[ref], ref, grid, form, high);\n",
+  "  }\n",
+  "}\n",
+  "#endif\n",
+  "#ifdef TRB_WITH_SORT\n",
+  "#line 5 \"kernels/sort.cl\"\n",
+  "#ifdef TRB_CPU\n",
+  "\n",
+  "TRB_KERNEL trb_k_count_digits(const __global trb_plan *plan, const __global ulong *keys, __global uint *histograms, uint shift) {\n",
+  "  const uint first = TRB_GROUP_ID * TRB_SORT_BLOCK;\n",
+  "  const uint count = first < plan->ref_count ? min(plan->ref_count - first, TRB_SORT_BLOCK) : 0;\n",
+  "  trb_count_digits(keys + first, count, shift, histograms + (size_t)TRB_GROUP_ID * TRB_DIGITS);\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_place_digits(__global uint *histograms, uint blocks) { trb_place_digits(histograms, blocks); }\n",
+  "\n",
+  "TRB_KERNEL trb_k_scatter_keys(const __global trb_plan *plan, const __global ulong *keys, __global uint *histograms,\n",
+  "                              __global ulong *sorted, uint shift) {\n",
+  "  const uint first = TRB_GROUP_ID * TRB_SORT_BLOCK;\n",
+  "  const uint count = first < plan->ref_count ? min(plan->ref_count - first, TRB_SORT_BLOCK) : 0;\n",
+  "  trb_scatter_keys(keys + first, count, shift, histograms + (size_t)TRB_GROUP_ID * TRB_DIGITS, sorted);\n",
+  "}\n",
+  "#else\n",
+  "\n",
+  "\n",
+  "\n",
+  "#define TRB_ITEMS (TRB_TILE / TRB_GROUP)\n",
+  "#define TRB_DIGIT(key, shift) ((uint)((key) >> (shift)) & 255u)\n",
+  "\n",
+  "TRB_KERNEL trb_k_count_digits(const __global trb_plan *plan, const __global ulong *keys, __global uint *histograms, uint shift) {\n",
+  "  __local uint counts[256];\n",
+  "  const uint first = TRB_GROUP_ID * TRB_TILE, end = min(plan->ref_count, first + TRB_TILE);\n",
+  "  uint i;\n",
+  "  counts[TRB_LOCAL_ID] = 0;\n",
+  "  barrier(CLK_LOCAL_MEM_FENCE);\n",
+  "  for (i = first + TRB_LOCAL_ID; i < end; i += TRB_GROUP) atomic_inc((volatile __local uint *)&counts[TRB_DIGIT(keys[i], shift)]);\n",
+  "  barrier(CLK_LOCAL_MEM_FENCE);\n",
+  "  histograms[TRB_LOCAL_ID * (uint)get_num_groups(0) + TRB_GROUP_ID] = counts[TRB_LOCAL_ID];\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_sum_tiles(const __global uint *values, __global uint *sums, uint count) {\n",
+  "  __local uint space[TRB_GROUP];\n",
+  "  const uint first = TRB_GROUP_ID * TRB_TILE, end = min(count, first + TRB_TILE);\n",
+  "  uint i, sum = 0, total;\n",
+  "  for (i = first + TRB_LOCAL_ID; i < end; i += TRB_GROUP) sum += values[i];\n",
+  "  trb_scan(sum, space, &total);\n",
+  "  if (TRB_LOCAL_ID == 0) sums[TRB_GROUP_ID] = total;\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_scan_tiles(__global uint *values, const __global uint *starts, uint count) {\n",
+  "  __local uint space[TRB_GROUP];\n",
+  "  const uint first = TRB_GROUP_ID * TRB_TILE, end = min(count, first + TRB_TILE);\n",
+  "  uint i, start = starts[TRB_GROUP_ID], total;\n",
+  "  for (i = first; i < end; i += TRB_GROUP) {\n",
+  "    const uint mine = i + TRB_LOCAL_ID, value = mine < end ? values[mine] : 0;\n",
+  "    const uint before = trb_scan(value, space, &total);\n",
+  "    if (mine < end) values[mine] = start + before;\n",
+  "    start += total;\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_scatter_keys(const __global trb_plan *plan, const __global ulong *keys, const __global uint *starts,\n",
+  "                              __global ulong *sorted, uint shift) {\n",
+  "  __local ulong tile[TRB_TILE];\n",
+  "  __local ushort counts[16 * TRB_GROUP];\n",
+  "  __local uint space[TRB_GROUP], digit_first[256];\n",
+  "  const uint id = TRB_LOCAL_ID, first = TRB_GROUP_ID * TRB_TILE;\n",
+  "  const uint count = first < plan->ref_count ? min(plan->ref_count - first, TRB_TILE) : 0;\n",
+  "  ulong mine[TRB_ITEMS];\n",
+  "  uint i, k, total, half_digit;\n",
+  "  for (i = id; i < TRB_TILE; i += TRB_GROUP) tile[i] = i < count ? keys[first + i] : ~(ulong)0;\n",
+  "  for (half_digit = 0; half_digit < 8; half_digit += 4) {\n",
+  "    uint sum = 0;\n",
+  "    barrier(CLK_LOCAL_MEM_FENCE);\n",
+  "    for (k = 0; k < 16; k++) counts[k * TRB_GROUP + id] = 0;\n",
+  "    for (k = 0; k < TRB_ITEMS; k++) {\n",
+  "      mine[k] = tile[id * TRB_ITEMS + k];\n",
+  "      counts[(TRB_DIGIT(mine[k], shift) >> half_digit & 15) * TRB_GROUP + id]++;\n",
+  "    }\n",
+  "    barrier(CLK_LOCAL_MEM_FENCE);\n",
+  "    for (k = 0; k < 16; k++) sum += counts[id * 16 + k];\n",
+  "    sum = trb_scan(sum, space, &total);\n",
+  "    for (k = 0; k < 16; k++) {\n",
+  "      uint n = counts[id * 16 + k];\n",
+  "      counts[id * 16 + k] = (ushort)sum;\n",
+  "      sum += n;\n",
+  "    }\n",
+  "    barrier(CLK_LOCAL_MEM_FENCE);\n",
+  "    for (k = 0; k < TRB_ITEMS; k++) tile[counts[(TRB_DIGIT(mine[k], shift) >> half_digit & 15) * TRB_GROUP + id]++] = mine[k];\n",
+  "  }\n",
+  "  barrier(CLK_LOCAL_MEM_FENCE);\n",
+  "  for (i = id; i < TRB_TILE; i += TRB_GROUP)\n",
+  "    if (i == 0 || TRB_DIGIT(tile[i], shift) != TRB_DIGIT(tile[i - 1], shift)) digit_first[TRB_DIGIT(tile[i], shift)] = i;\n",
+  "  barrier(CLK_LOCAL_MEM_FENCE);\n",
+  "  for (i = id; i < count; i += TRB_GROUP) {\n",
+  "    const uint digit = TRB_DIGIT(tile[i], shift);\n",
+  "    sorted[starts[digit * (uint)get_num_groups(0) + TRB_GROUP_ID] + i - digit_first[digit]] = tile[i];\n",
+  "  }\n",
+  "}\n",
+  "#endif\n",
+  "#endif\n",
+  "#ifdef TRB_WITH_HIERARCHY\n",
+  "#line 4 \"kernels/hierarchy.cl\"\n",
+  "static trb_curve trb_plan_curve(const __global trb_plan *plan, const __global ulong *keys, const __global trbvh_node *refs) {\n",
+  "  trb_curve curve;\n",
+  "  curve.keys = keys;\n",
+  "  curve.refs = refs;\n",
+  "  curve.grid = plan->grid;\n",
+  "  curve.form = plan->form;\n",
+  "  curve.count = plan->ref_count;\n",
+  "  return curve;\n",
+  "}\n",
+  "\n",
+  "#ifdef TRB_CPU\n",
+  "TRB_KERNEL trb_k_build_blocks(const __global trb_plan *plan, const __global ulong *keys, const __global trbvh_node *refs,\n",
+  "                              __global trbvh_node *nodes, __global trb_range *ranges) {\n",
+  "  const trb_curve curve = trb_plan_curve(plan, keys, refs);\n",
+  "  const uint first = TRB_GROUP_ID * TRB_BLOCK;\n",
+  "  if (first < curve.count)\n",
+  "    trb_build_block(&curve, first, min(curve.count, first + TRB_BLOCK), plan->costs, nodes, &ranges[TRB_GROUP_ID]);\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_build_top(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_range *ranges) {\n",
+  "  const uint count = plan->ref_count;\n",
+  "  if (count) trb_build_top(nodes, ranges, (count - 1) / TRB_BLOCK + 1, plan->costs);\n",
+  "}\n",
+  "#else\n",
+  "#line 38 \"kernels/hierarchy.cl\"\n",
+  "static void trb_hang(const trb_curve *curve, __global trbvh_node *nodes, __global trb_wait *waits, trbvh_node node,\n",
+  "                     uint first, uint last) {\n",
+  "  const ulong left = trb_split_after(curve, first - 1), right = trb_split_after(curve, last);\n",
+  "  if (first == 0 && last == curve->count - 1) {\n",
+  "    nodes[0] = node;\n",
+  "  } else if (left <= right) {\n",
+  "    nodes[2 * first + 1] = node;\n",
+  "    waits[first - 1].last = last + 1;\n",
+  "  } else {\n",
+  "    nodes[2 * last + 2] = node;\n",
+  "    waits[last].first = first + 1;\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "static void trb_make_split(const trb_curve *curve, __global trbvh_node *nodes, __global trb_wait *waits, uint split,\n",
+  "                           trb_costs costs) {\n",
+  "  const uint pair = split + 1;\n",
+  "  const trbvh_node node = trb_parent(nodes[2 * pair], nodes[2 * pair + 1], 2 * pair, costs);\n",
+  "  trb_hang(curve, nodes, waits, node, waits[split].first - 1, waits[split].last - 1);\n",
+  "}\n",
+  "\n",
+  "static bool trb_is_ready(const __global trb_wait *waits, uint split) {\n",
+  "  return waits[split].first != 0 && waits[split].last != 0;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_build_chunks(const __global trb_plan *plan, const __global ulong *keys, const __global trbvh_node *refs,\n",
+  "                              __global trbvh_node *nodes, __global trb_wait *waits, __global uint *waiting,\n",
+  "                              __global uint *counts) {\n",
+  "  __local uint space[TRB_GROUP], ready_count;\n",
+  "  const trb_curve curve = trb_plan_curve(plan, keys, refs);\n",
+  "  const trb_costs costs = plan->costs;\n",
+  "  const uint id = TRB_LOCAL_ID, first = TRB_GROUP_ID * TRB_GPU_CHUNK, end = min(curve.count, first + TRB_GPU_CHUNK);\n",
+  "  uint i, k, done = 0, kept = 0, total;\n",
+  "  for (i = first + id; i < end; i += TRB_GROUP) {\n",
+  "    const trbvh_node ref = refs[trb_key_ref(keys[i], curve.form)];\n",
+  "    trb_hang(&curve, nodes, waits, trb_reference(ref, costs), i, i);\n",
+  "  }\n",
+  "  for (;;) {\n",
+  "    uint ready = 0;\n",
+  "    TRB_SYNC();\n",
+  "    if (id == 0) ready_count = 0;\n",
+  "    TRB_SYNC();\n",
+  "    for (i = first + id, k = 1; i + 1 < end; i += TRB_GROUP, k *= 2)\n",
+  "      if (!(done & k) && trb_is_ready(waits, i)) ready |= k;\n",
+  "    if (ready) atomic_inc((volatile __local uint *)&ready_count);\n",
+  "    TRB_SYNC();\n",
+  "    if (ready_count == 0) break;\n",
+  "    for (i = first + id, k = 1; i + 1 < end; i += TRB_GROUP, k *= 2)\n",
+  "      if (ready & k) trb_make_split(&curve, nodes, waits, i, costs);\n",
+  "    done |= ready;\n",
+  "  }\n",
+  "  for (i = first + id, k = 1; i < end; i += TRB_GROUP, k *= 2) kept += !(done & k);\n",
+  "  kept = trb_scan(kept, space, &total);\n",
+  "  for (i = first + id, k = 1; i < end; i += TRB_GROUP, k *= 2)\n",
+  "    if (!(done & k)) waiting[first + kept++] = i;\n",
+  "  if (id == 0) counts[TRB_GROUP_ID] = total;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_join_chunks(const __global trb_plan *plan, const __global ulong *keys, const __global trbvh_node *refs,\n",
+  "                             __global trbvh_node *nodes, __global trb_wait *waits, const __global uint *waiting,\n",
+  "                             const __global uint *counts, __global uint *still_waiting, __global uint *still_counts,\n",
+  "                             uint size) {\n",
+  "  __local uint space[TRB_GROUP], ready_count;\n",
+  "  const trb_curve curve = trb_plan_curve(plan, keys, refs);\n",
+  "  const trb_costs costs = plan->costs;\n",
+  "  const uint id = TRB_LOCAL_ID, chunk = TRB_GROUP_ID * TRB_GPU_CHUNKS, chunks = curve.count ? (curve.count - 1) / size + 1 : 0;\n",
+  "  const ulong reach = (ulong)(chunk + TRB_GPU_CHUNKS) * size;\n",
+  "  const uint first = chunk * size, end = reach < curve.count ? (uint)reach : curve.count;\n",
+  "  __global uint *list = still_waiting + first;\n",
+  "  uint i, k, count = 0, kept = 0, total;\n",
+  "  for (k = chunk; k < chunk + TRB_GPU_CHUNKS && k < chunks; k++) {\n",
+  "    for (i = id; i < counts[k]; i += TRB_GROUP) list[count + i] = waiting[(size_t)k * size + i];\n",
+  "    count += counts[k];\n",
+  "  }\n",
+  "\n",
+  "  for (;;) {\n",
+  "    uint ready = 0;\n",
+  "    TRB_SYNC();\n",
+  "    if (id == 0) ready_count = 0;\n",
+  "    TRB_SYNC();\n",
+  "    for (i = id; i < count; i += TRB_GROUP)\n",
+  "      if (list[i] < end - 1 && trb_is_ready(waits, list[i])) {\n",
+  "        list[i] |= 0x80000000u;\n",
+  "        ready = 1;\n",
+  "      }\n",
+  "    if (ready) atomic_inc((volatile __local uint *)&ready_count);\n",
+  "    TRB_SYNC();\n",
+  "    if (ready_count == 0) break;\n",
+  "    for (i = id; i < count; i += TRB_GROUP)\n",
+  "      if (list[i] >= 0x80000000u && list[i] != TRBVH_NONE) {\n",
+  "        trb_make_split(&curve, nodes, waits, list[i] & 0x7FFFFFFFu, costs);\n",
+  "        list[i] = TRBVH_NONE;\n",
+  "      }\n",
+  "  }\n",
+  "  for (i = 0; i < count; i += TRB_GROUP) {\n",
+  "    const uint split = i + id < count ? list[i + id] : TRBVH_NONE;\n",
+  "    const uint before = trb_scan(split != TRBVH_NONE, space, &total);\n",
+  "    TRB_SYNC();\n",
+  "    if (split != TRBVH_NONE) list[kept + before] = split;\n",
+  "    kept += total;\n",
+  "  }\n",
+  "  if (id == 0) still_counts[TRB_GROUP_ID] = kept;\n",
+  "}\n",
+  "#endif\n",
+  "#endif\n",
+  "#ifdef TRB_WITH_TREELETS\n",
+  "#line 5 \"kernels/treelets.cl\"\n",
+  "#ifdef TRB_CPU\n",
+  "TRB_KERNEL trb_k_find_groups(__global trb_plan *plan, const __global trbvh_node *nodes, __global uint *top,\n",
+  "                             __global uint *lists, __global trb_group *groups, uint gamma) {\n",
+  "  plan->groups = plan->ref_count ? trb_find_groups(nodes, top, lists, groups, gamma) : 0;\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_restructure(const __global trb_plan *plan, __global trbvh_node *nodes, __global uint *lists,\n",
+  "                             const __global trb_group *groups, uint gamma) {\n",
+  "  if (TRB_GROUP_ID < plan->groups) trb_restructure_group(nodes, lists, groups[TRB_GROUP_ID], gamma, plan->costs);\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_restructure_top(const __global trb_plan *plan, __global trbvh_node *nodes, __global uint *lists, uint gamma) {\n",
+  "  if (plan->ref_count) trb_restructure_top(nodes, lists, plan->ref_count, gamma, plan->costs);\n",
+  "}\n",
+  "#else\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_first_level(const __global trb_plan *plan, const __global trbvh_node *nodes, __global trb_level *levels,\n",
+  "                             __global uint *list, uint gamma) {\n",
+  "  uint i;\n",
+  "  for (i = TRB_LOCAL_ID; i < TRB_GPU_LEVELS; i += TRB_GROUP) levels[i].first = levels[i].count = 0;\n",
+  "  TRB_SYNC();\n",
+  "  if (TRB_LOCAL_ID != 0 || plan->ref_count == 0) return;\n",
+  "  list[0] = 0;\n",
+  "  levels[0].count = trb_count(nodes[0].count) >= gamma;\n",
+  "}\n",
+  "\n",
+  "static void trb_list_level(const __global trbvh_node *nodes, __global trb_level *levels, __global uint *list, uint level,\n",
+  "                           uint gamma, uint item, uint items, __local uint *space) {\n",
+  "  const uint first = levels[level].first, count = levels[level].count, next = first + count;\n",
+  "  uint i;\n",
+  "  for (i = item; i - TRB_LOCAL_ID < count; i += items) {\n",
+  "    uint found = 0, child[2] = {0, 0}, side, at;\n",
+  "    if (i < count) {\n",
+  "      const uint pair = nodes[list[first + i]].first;\n",
+  "      for (side = 0; side < 2; side++)\n",
+  "        if (trb_count(nodes[pair + side].count) >= gamma) child[found++] = pair + side;\n",
+  "    }\n",
+  "    at = next + trb_reserve(&levels[level + 1].count, found, space);\n",
+  "    for (side = 0; side < found; side++) list[at + side] = child[side];\n",
+  "  }\n",
+  "  if (item == 0) levels[level + 1].first = next;\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_list_level(const __global trbvh_node *nodes, __global trb_level *levels, __global uint *list, uint gamma,\n",
+  "                            uint level) {\n",
+  "  __local uint space[2];\n",
+  "  trb_list_level(nodes, levels, list, level, gamma, (uint)get_global_id(0), (uint)get_global_size(0), space);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_list_levels(const __global trbvh_node *nodes, __global trb_level *levels, __global uint *list, uint gamma,\n",
+  "                             uint level) {\n",
+  "  __local uint space[2];\n",
+  "  for (; level + 1 < TRB_GPU_LEVELS && levels[level].count; level++) {\n",
+  "    trb_list_level(nodes, levels, list, level, gamma, TRB_LOCAL_ID, TRB_GROUP, space);\n",
+  "    TRB_SYNC();\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "#define TRB_TREELET_KERNEL __kernel __attribute__((reqd_work_group_size(TRB_LANES, 1, 1))) void\n",
+  "\n",
+  "static void trb_restructure_lane(__global trbvh_node *nodes, __local trb_treelets *t, uint root, trb_costs costs) {\n",
+  "  const uint lane = TRB_LOCAL_ID;\n",
+  "  uint i;\n",
+  "  trb_expand(nodes, t, lane, 0, 0, root);\n",
+  "  for (i = 1; i < TRB_TREELET - 1; i++) trb_expand_largest(nodes, t, lane, i);\n",
+  "  for (i = 0; i < TRB_TREELET; i++) trb_enter_leaf(nodes, t, lane, i);\n",
+  "  trb_treelet_costs(t->leaves + lane, t->table + lane, costs);\n",
+  "  trb_finish_treelet(nodes, t, lane, root, costs);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_TREELET_KERNEL trb_k_restructure_level(const __global trb_plan *plan, __global trbvh_node *nodes,\n",
+  "                                           const __global trb_level *levels, const __global uint *list, uint level,\n",
+  "                                           uint begin) {\n",
+  "  __local trb_treelets t;\n",
+  "  const uint i = begin + (uint)get_global_id(0);\n",
+  "  if (i < levels[level].count) trb_restructure_lane(nodes, &t, list[levels[level].first + i], plan->costs);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_TREELET_KERNEL trb_k_restructure_levels(const __global trb_plan *plan, __global trbvh_node *nodes,\n",
+  "                                            const __global trb_level *levels, const __global uint *list, uint level) {\n",
+  "  __local trb_treelets t;\n",
+  "  uint lowest = level, i;\n",
+  "  while (lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;\n",
+  "  for (lowest++; lowest-- > level;) {\n",
+  "    for (i = TRB_LOCAL_ID; i < levels[lowest].count; i += TRB_LANES)\n",
+  "      trb_restructure_lane(nodes, &t, list[levels[lowest].first + i], plan->costs);\n",
+  "    TRB_SYNC();\n",
+  "  }\n",
+  "}\n",
+  "#endif\n",
+  "#endif\n",
+  "#ifdef TRB_WITH_COLLAPSE\n",
+  "#line 5 \"kernels/collapse.cl\"\n",
+  "static trb_collapser trb_plan_collapser(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *spare,\n",
+  "                                        __global uint *keys, __global uint *sorted) {\n",
+  "  trb_collapser c;\n",
+  "  c.nodes = nodes;\n",
+  "  c.spare = spare;\n",
+  "  c.words[0] = keys;\n",
+  "  c.words[1] = sorted;\n",
+  "  c.costs = plan->costs;\n",
+  "  c.cost_node = plan->cost_node;\n",
+  "  c.cost_prim = plan->cost_prim;\n",
+  "  c.split = plan->split_max != 0;\n",
+  "  c.out = 0;\n",
+  "  c.prims = 0;\n",
+  "  return c;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "static trb_collapser trb_plan_emitter(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *out,\n",
+  "                                      __global uint *prims) {\n",
+  "  trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0, 0);\n",
+  "  c.out = out;\n",
+  "  c.prims = prims;\n",
+  "  return c;\n",
+  "}\n",
+  "\n",
+  "static void trb_emit_padding(__global trbvh_node *out) {\n",
+  "  uint k;\n",
+  "  for (k = 0; k < 3; k++) out[1].min[k] = out[1].max[k] = 0;\n",
+  "  out[1].first = out[1].count = 0;\n",
+  "}\n",
+  "\n",
+  "#ifdef TRB_CPU\n",
+  "TRB_KERNEL trb_k_find_tasks(__global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *spare,\n",
+  "                            __global uint *keys, __global uint *sorted, __global trb_task *tasks) {\n",
+  "  const trb_collapser c = trb_plan_collapser(plan, nodes, spare, keys, sorted);\n",
+  "  float sah = 0;\n",
+  "  plan->tasks = plan->ref_count ? trb_find_tasks(&c, tasks, &sah) : 0;\n",
+  "  plan->sah = sah;\n",
+  "  plan->root_area = trb_sah_term(nodes[0], 1);\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_count_tasks(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *spare,\n",
+  "                             __global uint *keys, __global uint *sorted, __global trb_task *tasks) {\n",
+  "  const trb_collapser c = trb_plan_collapser(plan, nodes, spare, keys, sorted);\n",
+  "  uint i;\n",
+  "  for (i = TRB_GROUP_ID; i < plan->tasks; i += (uint)get_num_groups(0)) trb_count_task(&c, &tasks[i]);\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_sum_tasks(__global trb_plan *plan, const __global trb_task *tasks) {\n",
+  "  uint i, leaves = 0, prims = 0, max_depth = 0;\n",
+  "  float sah = plan->sah;\n",
+  "  for (i = 0; i < plan->tasks; i++) {\n",
+  "    leaves += tasks[i].leaves;\n",
+  "    prims += tasks[i].prims;\n",
+  "    sah += tasks[i].sah;\n",
+  "    max_depth = max(max_depth, tasks[i].max_depth);\n",
+  "  }\n",
+  "  plan->leaves = leaves;\n",
+  "  plan->prims = prims;\n",
+  "  plan->max_depth = max_depth;\n",
+  "  plan->sah = sah;\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_emit_top(const __global trb_plan *plan, __global trbvh_node *nodes, __global trb_task *tasks,\n",
+  "                          __global trbvh_node *out, __global uint *prims) {\n",
+  "  const trb_collapser c = trb_plan_emitter(plan, nodes, out, prims);\n",
+  "  trb_emit_padding(out);\n",
+  "  trb_emit_top(&c, tasks);\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_emit_tasks(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_task *tasks,\n",
+  "                            __global trbvh_node *out, __global uint *prims) {\n",
+  "  const trb_collapser c = trb_plan_emitter(plan, nodes, out, prims);\n",
+  "  uint i;\n",
+  "  for (i = TRB_GROUP_ID; i < plan->tasks; i += (uint)get_num_groups(0)) trb_emit_task(&c, tasks[i]);\n",
+  "}\n",
+  "#else\n",
+  "\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_first_inner(const __global trb_plan *plan, const __global trbvh_node *nodes, __global trb_level *levels,\n",
+  "                             __global uint *list, __global uint *first_refs) {\n",
+  "  uint i;\n",
+  "  for (i = TRB_LOCAL_ID; i < TRB_GPU_LEVELS; i += TRB_GROUP) levels[i].first = levels[i].count = 0;\n",
+  "  TRB_SYNC();\n",
+  "  if (TRB_LOCAL_ID != 0 || plan->ref_count == 0) return;\n",
+  "  list[0] = first_refs[0] = 0;\n",
+  "  levels[0].count = !trb_is_leaf(nodes[0].count);\n",
+  "}\n",
+  "\n",
+  "static void trb_list_inner(const trb_collapser *c, __global trb_level *levels, __global uint *list, __global uint *first_refs,\n",
+  "                           uint level, uint item, uint items, __local uint *space) {\n",
+  "  const uint first = levels[level].first, count = levels[level].count, next = first + count;\n",
+  "  uint i;\n",
+  "  for (i = item; i - TRB_LOCAL_ID < count; i += items) {\n",
+  "    uint found = 0, child[2] = {0, 0}, refs[2] = {0, 0}, side, at;\n",
+  "    if (i < count) {\n",
+  "      const uint first_ref = first_refs[first + i], pair = trb_bounded_node(c, list[first + i], level, first_ref).first;\n",
+  "      const uint left = trb_count(c->nodes[pair].count);\n",
+  "      for (side = 0; side < 2; side++)\n",
+  "        if (!trb_is_leaf(c->nodes[pair + side].count)) {\n",
+  "          child[found] = pair + side;\n",
+  "          refs[found++] = first_ref + (side ? left : 0);\n",
+  "        }\n",
+  "    }\n",
+  "    at = next + trb_reserve(&levels[level + 1].count, found, space);\n",
+  "    for (side = 0; side < found; side++) {\n",
+  "      list[at + side] = child[side];\n",
+  "      first_refs[at + side] = refs[side];\n",
+  "    }\n",
+  "  }\n",
+  "  if (item == 0) levels[level + 1].first = next;\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_list_inner(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *spare,\n",
+  "                            __global uint *keys, __global uint *sorted, __global trb_level *levels, __global uint *list,\n",
+  "                            __global uint *first_refs, uint level) {\n",
+  "  __local uint space[2];\n",
+  "  const trb_collapser c = trb_plan_collapser(plan, nodes, spare, keys, sorted);\n",
+  "  trb_list_inner(&c, levels, list, first_refs, level, (uint)get_global_id(0), (uint)get_global_size(0), space);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_list_rest(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *spare,\n",
+  "                           __global uint *keys, __global uint *sorted, __global trb_level *levels, __global uint *list,\n",
+  "                           __global uint *first_refs, uint level) {\n",
+  "  __local uint space[2];\n",
+  "  const trb_collapser c = trb_plan_collapser(plan, nodes, spare, keys, sorted);\n",
+  "  for (; level + 1 < TRB_GPU_LEVELS && levels[level].count; level++) {\n",
+  "    trb_list_inner(&c, levels, list, first_refs, level, TRB_LOCAL_ID, TRB_GROUP, space);\n",
+  "    TRB_SYNC();\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "static void trb_count_inner(const trb_collapser *c, __global trb_place *places, uint index) {\n",
+  "  const trbvh_node node = c->nodes[index];\n",
+  "  trb_place sum;\n",
+  "  uint side;\n",
+  "  sum.inner = 1;\n",
+  "  sum.prims = sum.pair = sum.next = sum.prim = 0;\n",
+  "  sum.sah = trb_sah_term(node, c->cost_node);\n",
+  "  for (side = 0; side < 2; side++) {\n",
+  "    const trbvh_node child = c->nodes[node.first + side];\n",
+  "    if (trb_is_leaf(child.count)) {\n",
+  "      const uint count = trb_count_prims(c, child);\n",
+  "      sum.prims += count;\n",
+  "      sum.sah += trb_sah_term(child, c->cost_prim * count);\n",
+  "    } else {\n",
+  "      const trb_place below = places[child.first / 2];\n",
+  "      sum.inner += below.inner;\n",
+  "      sum.prims += below.prims;\n",
+  "      sum.sah += below.sah;\n",
+  "    }\n",
+  "  }\n",
+  "  places[node.first / 2] = sum;\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_count_inner(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,\n",
+  "                             const __global uint *list, __global trb_place *places, uint level) {\n",
+  "  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0, 0);\n",
+  "  const uint first = levels[level].first, count = levels[level].count;\n",
+  "  uint i;\n",
+  "  TRB_FOR(i, count) trb_count_inner(&c, places, list[first + i]);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_count_rest(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,\n",
+  "                            const __global uint *list, __global trb_place *places, uint level) {\n",
+  "  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0, 0);\n",
+  "  uint lowest = level, i;\n",
+  "  while (lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;\n",
+  "  for (lowest++; lowest-- > level;) {\n",
+  "    for (i = TRB_LOCAL_ID; i < levels[lowest].count; i += TRB_GROUP)\n",
+  "      trb_count_inner(&c, places, list[levels[lowest].first + i]);\n",
+  "    TRB_SYNC();\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_sum_inner(__global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,\n",
+  "                           __global trb_place *places) {\n",
+  "  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0, 0);\n",
+  "  uint depth = 0;\n",
+  "  if (TRB_LOCAL_ID != 0) return;\n",
+  "  plan->leaves = plan->prims = plan->max_depth = 0;\n",
+  "  if (plan->ref_count == 0) return;\n",
+  "  plan->root_area = trb_sah_term(nodes[0], 1);\n",
+  "  if (trb_is_leaf(nodes[0].count)) {\n",
+  "    plan->leaves = 1;\n",
+  "    plan->prims = trb_count_prims(&c, nodes[0]);\n",
+  "    plan->sah = trb_sah_term(nodes[0], c.cost_prim * plan->prims);\n",
+  "  } else {\n",
+  "    __global trb_place *root = &places[nodes[0].first / 2];\n",
+  "    while (levels[depth].count) depth++;\n",
+  "    plan->leaves = root->inner + 1;\n",
+  "    plan->prims = root->prims;\n",
+  "    plan->sah = root->sah;\n",
+  "    plan->max_depth = depth;\n",
+  "    root->pair = 1;\n",
+  "    root->next = 2;\n",
+  "    root->prim = 0;\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "\n",
+  "static void trb_place_children(const trb_collapser *c, __global trb_place *places, uint index) {\n",
+  "  const trbvh_node node = c->nodes[index];\n",
+  "  const trb_place place = places[node.first / 2];\n",
+  "  const int top = trb_count(node.count) > TRB_BLOCK;\n",
+  "  trbvh_node child[2];\n",
+  "  uint next = place.next, p = place.prim, side;\n",
+  "  trb_place below[2];\n",
+  "  for (side = 0; side < 2; side++) {\n",
+  "    child[side] = c->nodes[node.first + side];\n",
+  "    if (trb_is_leaf(child[side].count)) {\n",
+  "      p += trb_emit_leaf(c, child[side], 2 * place.pair + side, p);\n",
+  "    } else {\n",
+  "      below[side] = places[child[side].first / 2];\n",
+  "      below[side].pair = next++;\n",
+  "      trb_emit_inner(c, child[side], 2 * place.pair + side, below[side].pair);\n",
+  "      if (top) {\n",
+  "        below[side].next = next;\n",
+  "        below[side].prim = p;\n",
+  "        next += below[side].inner - 1;\n",
+  "        p += below[side].prims;\n",
+  "      }\n",
+  "    }\n",
+  "  }\n",
+  "  for (side = 2; side-- > 0 && !top;)\n",
+  "    if (!trb_is_leaf(child[side].count)) {\n",
+  "      below[side].next = next;\n",
+  "      below[side].prim = p;\n",
+  "      next += below[side].inner - 1;\n",
+  "      p += below[side].prims;\n",
+  "    }\n",
+  "  for (side = 0; side < 2; side++)\n",
+  "    if (!trb_is_leaf(child[side].count)) places[child[side].first / 2] = below[side];\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_emit_root(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *out,\n",
+  "                           __global uint *prims) {\n",
+  "  const trb_collapser c = trb_plan_emitter(plan, nodes, out, prims);\n",
+  "  if (TRB_LOCAL_ID != 0) return;\n",
+  "  trb_emit_padding(out);\n",
+  "  if (trb_is_leaf(nodes[0].count)) trb_emit_leaf(&c, nodes[0], 0, 0);\n",
+  "  else trb_emit_inner(&c, nodes[0], 0, 1);\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_emit_level(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,\n",
+  "                            const __global uint *list, __global trb_place *places, __global trbvh_node *out,\n",
+  "                            __global uint *prims, uint level) {\n",
+  "  const trb_collapser c = trb_plan_emitter(plan, nodes, out, prims);\n",
+  "  const uint first = levels[level].first, count = levels[level].count;\n",
+  "  uint i;\n",
+  "  TRB_FOR(i, count) trb_place_children(&c, places, list[first + i]);\n",
+  "}\n",
+  "#endif\n",
+  "#endif\n",
+  "#ifdef TRB_WITH_OUTPUT\n",
+  "#line 4 \"kernels/output.cl\"\n",
+  "TRB_KERNEL trb_k_triangles(const __global trb_plan *plan, const __global char *positions, const __global char *indices,\n",
+  "                           const __global uint *prims, __global trbvh_triangle *triangles, uint count) {\n",
+  "  const trb_mesh mesh = trb_plan_mesh(plan, positions, indices);\n",
+  "#ifdef TRB_CPU\n",
+  "  const uint first = TRB_GROUP_ID * TRB_BLOCK;\n",
+  "  trb_make_triangles(&mesh, prims, first, min(count, first + TRB_BLOCK), triangles);\n",
+  "#else\n",
+  "  uint i;\n",
+  "  TRB_FOR(i, count) trb_make_triangle(&mesh, prims[i], &triangles[i]);\n",
+  "#endif\n",
+  "}\n",
+  "#endif\n",
+  "#ifdef TRB_WITH_REFIT\n",
+  "#line 5 \"kernels/refit.cl\"\n",
+  "TRB_KERNEL trb_k_first_refit(const __global trbvh_node *nodes, __global trb_level *levels, __global uint *list) {\n",
+  "  uint i;\n",
+  "  for (i = TRB_LOCAL_ID; i < TRB_GPU_LEVELS; i += TRB_GROUP) levels[i].first = levels[i].count = 0;\n",
+  "  TRB_SYNC();\n",
+  "  if (TRB_LOCAL_ID != 0) return;\n",
+  "  list[0] = 0;\n",
+  "  levels[0].count = nodes[0].count == 0;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_list_refit(const __global trbvh_node *nodes, __global trb_level *levels, __global uint *list, uint level) {\n",
+  "  __local uint space[2];\n",
+  "  const uint first = levels[level].first, count = levels[level].count, next = first + count;\n",
+  "  const uint items = (uint)get_global_size(0);\n",
+  "  uint i;\n",
+  "  for (i = (uint)get_global_id(0); i - TRB_LOCAL_ID < count; i += items) {\n",
+  "    uint found = 0, child[2] = {0, 0}, side, at;\n",
+  "    if (i < count) {\n",
+  "      const uint pair = nodes[list[first + i]].first;\n",
+  "      for (side = 0; side < 2; side++)\n",
+  "        if (nodes[pair + side].count == 0) child[found++] = pair + side;\n",
+  "    }\n",
+  "    at = next + trb_reserve(&levels[level + 1].count, found, space);\n",
+  "    for (side = 0; side < found; side++) list[at + side] = child[side];\n",
+  "  }\n",
+  "  if (get_global_id(0) == 0) levels[level + 1].first = next;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_refit_leaves(const __global trb_plan *plan, const __global char *positions, const __global char *indices,\n",
+  "                              const __global uint *prims, __global trbvh_node *nodes, uint count) {\n",
+  "  const trb_mesh mesh = trb_plan_mesh(plan, positions, indices);\n",
+  "  uint i, k;\n",
+  "  TRB_FOR(i, count) {\n",
+  "    trbvh_node leaf = nodes[i], sum = trb_no_box();\n",
+  "    if (leaf.count == 0) continue;\n",
+  "    for (k = leaf.first; k < leaf.first + leaf.count; k++) {\n",
+  "      trbvh_node box;\n",
+  "      float v[3][3];\n",
+  "      uint vertex;\n",
+  "      if (trb_prim_box(&mesh, prims[k], &box, v, &vertex) > 0) trb_include(&sum, box.min, box.max);\n",
+  "    }\n",
+  "    for (k = 0; k < 3; k++) {\n",
+  "      nodes[i].min[k] = sum.min[k];\n",
+  "      nodes[i].max[k] = sum.max[k];\n",
+  "    }\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_refit_level(__global trbvh_node *nodes, const __global trb_level *levels, const __global uint *list,\n",
+  "                             uint level) {\n",
+  "  const uint first = levels[level].first, count = levels[level].count;\n",
+  "  uint i, k;\n",
+  "  for (i = (uint)get_global_id(0); i < count; i += (uint)get_global_size(0)) {\n",
+  "    const uint node = list[first + i];\n",
+  "    const trbvh_node left = nodes[nodes[node].first], right = nodes[nodes[node].first + 1];\n",
+  "    for (k = 0; k < 3; k++) {\n",
+  "      nodes[node].min[k] = TRB_MIN(left.min[k], right.min[k]);\n",
+  "      nodes[node].max[k] = TRB_MAX(left.max[k], right.max[k]);\n",
+  "    }\n",
+  "  }\n",
+  "}\n",
+  "#endif\n",
+  "#ifdef TRB_WITH_TRACE\n",
+  "#line 5 \"kernels/trace.cl\"\n",
+  "#ifdef TRB_CPU\n",
+  "  #define TRB_RAYS 64u\n",
+  "#else\n",
+  "  #define TRB_RAYS 1u\n",
+  "#endif\n",
+  "#define TRB_FOR_RAYS(i, begin, end) \\\n",
+  "  for (i = (begin) + (ulong)get_global_id(0) * TRB_RAYS, end = min((ulong)(end), i + TRB_RAYS); i < end; i++)\n",
+  "\n",
+  "TRB_KERNEL trb_k_intersect(const __global trbvh_node *nodes, const __global trbvh_triangle *triangles,\n",
+  "                           const __global trbvh_ray *rays, __global trbvh_hit *hits, uint empty, ulong begin, ulong end) {\n",
+  "  ulong i;\n",
+  "  TRB_FOR_RAYS(i, begin, end) {\n",
+  "    const trbvh_ray ray = rays[i];\n",
+  "    trbvh_hit hit;\n",
+  "    if (empty) {\n",
+  "      const __global trbvh_ray *scene = &rays[i];\n",
+  "      trb_ray r;\n",
+  "      trb_prepare_ray(&r, &ray, (const __global float *)scene);\n",
+  "      trb_miss(&r, &hit);\n",
+  "    } else {\n",
+  "      trbvh_intersect(nodes, triangles, ray, &hit);\n",
+  "    }\n",
+  "    hits[i] = hit;\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_occluded(const __global trbvh_node *nodes, const __global trbvh_triangle *triangles,\n",
+  "                          const __global trbvh_ray *rays, __global uchar *occluded, uint empty, ulong begin, ulong end) {\n",
+  "  ulong i;\n",
+  "  TRB_FOR_RAYS(i, begin, end) occluded[i] = empty ? 0 : (uchar)trbvh_occluded(nodes, triangles, rays[i]);\n",
+  "}\n",
+  "#endif\n",
+};
+#define TRB_CL_CORE_LINES 1456u   /* entries of trb_cl_text for user kernels: types, core, traversal */
+#define TRB_CL_LINES      2501u   /* all entries */
+#define TRB_CL_HASH       "728b75d7533a4da1"   /* FNV-1a 64 of all strings: part of the program cache's key */
+// >>kernels end -----------------------------------------------------------------------------------------------------
+
+TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
+  if (lines) *lines = TRB_CL_CORE_LINES;
+  return trb_cl_text;
+}
+
+static void trb_cl_say(trbvh_stats *stats, const char *format, const char *a, int b, const char *c) {
+  if (stats) snprintf(stats->message, sizeof stats->message, format, a, b, c);
+}
+
+#ifdef TRBVH_NO_OPENCL
+TRBVH_API uint32_t trbvh_cl_devices(trbvh_cl_info *out, uint32_t capacity) { (void)out; (void)capacity; return 0; }
+TRBVH_API trbvh_device *trbvh_cl_open(const trbvh_cl_desc *desc, trbvh_stats *stats) {
+  (void)desc;
+  trb_cl_say(stats, "compiled %s OpenCL", "without", 0, "");
+  return NULL;
+}
+TRBVH_API void trbvh_cl_close(trbvh_device *device) { (void)device; }
+TRBVH_API const char *trbvh_cl_name(const trbvh_device *device) { (void)device; return ""; }
+TRBVH_API trbvh_result trbvh_cl_build(trbvh_device *device, trbvh_cl_tree *tree, const trbvh_cl_geometry *geometry,
+                                      const trbvh_options *options, struct _cl_event **done) {
+  (void)device; (void)tree; (void)geometry; (void)options; (void)done;
+  return TRBVH_NO_DEVICE;
+}
+TRBVH_API trbvh_result trbvh_cl_refit(trbvh_device *device, trbvh_cl_tree *tree, const trbvh_cl_geometry *geometry,
+                                      struct _cl_event **done) {
+  (void)device; (void)tree; (void)geometry; (void)done;
+  return TRBVH_NO_DEVICE;
+}
+TRBVH_API trbvh_result trbvh_cl_intersect(trbvh_device *device, const trbvh_cl_tree *tree, struct _cl_mem *rays,
+                                          struct _cl_mem *hits, size_t count, struct _cl_event **done) {
+  (void)device; (void)tree; (void)rays; (void)hits; (void)count; (void)done;
+  return TRBVH_NO_DEVICE;
+}
+TRBVH_API trbvh_result trbvh_cl_occluded(trbvh_device *device, const trbvh_cl_tree *tree, struct _cl_mem *rays,
+                                         struct _cl_mem *occluded, size_t count, struct _cl_event **done) {
+  (void)device; (void)tree; (void)rays; (void)occluded; (void)count; (void)done;
+  return TRBVH_NO_DEVICE;
+}
+TRBVH_API trbvh_result trbvh_cl_upload(trbvh_device *device, trbvh_cl_tree *tree, const trbvh *bvh) {
+  (void)device; (void)tree; (void)bvh;
+  return TRBVH_NO_DEVICE;
+}
+TRBVH_API trbvh_result trbvh_cl_download(trbvh_device *device, const trbvh_cl_tree *tree, trbvh *bvh,
+                                         const trbvh_options *options) {
+  (void)device; (void)tree; (void)bvh; (void)options;
+  return TRBVH_NO_DEVICE;
+}
+TRBVH_API void trbvh_cl_free(trbvh_device *device, trbvh_cl_tree *tree) { (void)device; (void)tree; }
+#else
+
+// >>opencl ---- our own declarations of what is used of OpenCL 1.2, and the library, opened at run time --------------
+#if defined(_WIN32)
+  #ifndef WIN32_LEAN_AND_MEAN
+    #define WIN32_LEAN_AND_MEAN
+  #endif
+  #include <windows.h>
+  #define TRB_CL_CALL __stdcall
+#else
+  #include <dlfcn.h>
+  #define TRB_CL_CALL
+#endif
+
+typedef struct _cl_platform_id   *trb_cl_platform;
+typedef struct _cl_device_id     *trb_cl_device_id;
+typedef struct _cl_context       *trb_cl_context;
+typedef struct _cl_command_queue *trb_cl_queue;
+typedef struct _cl_mem           *trb_cl_mem;
+typedef struct _cl_program       *trb_cl_program;
+typedef struct _cl_kernel        *trb_cl_kernel;
+typedef struct _cl_event         *trb_cl_event;
+
+enum {                                   /* names and values of CL/cl.h */
+  TRB_CL_SUCCESS = 0, TRB_CL_DEVICE_NOT_FOUND = -1, TRB_CL_MEM_OBJECT_ALLOCATION_FAILURE = -4,
+  TRB_CL_INVALID_BUFFER_SIZE = -61,
+  TRB_CL_DEVICE_TYPE_CPU = 2, TRB_CL_DEVICE_TYPE_GPU = 4,
+  TRB_CL_PLATFORM_NAME = 0x0902,
+  TRB_CL_DEVICE_TYPE = 0x1000, TRB_CL_DEVICE_MAX_COMPUTE_UNITS = 0x1002, TRB_CL_DEVICE_MAX_WORK_GROUP_SIZE = 0x1004,
+  TRB_CL_DEVICE_GLOBAL_MEM_SIZE = 0x101F, TRB_CL_DEVICE_LOCAL_MEM_SIZE = 0x1023, TRB_CL_DEVICE_ENDIAN_LITTLE = 0x1026,
+  TRB_CL_DEVICE_AVAILABLE = 0x1027, TRB_CL_DEVICE_COMPILER_AVAILABLE = 0x1028, TRB_CL_DEVICE_NAME = 0x102B,
+  TRB_CL_DRIVER_VERSION = 0x102D, TRB_CL_DEVICE_VERSION = 0x102F, TRB_CL_DEVICE_PLATFORM = 0x1031,
+  TRB_CL_QUEUE_CONTEXT = 0x1090, TRB_CL_QUEUE_DEVICE = 0x1091, TRB_CL_QUEUE_PROPERTIES = 0x1093,
+  TRB_CL_QUEUE_OUT_OF_ORDER = 1, TRB_CL_QUEUE_PROFILING = 2,
+  TRB_CL_MEM_READ_WRITE = 1, TRB_CL_MEM_READ_ONLY = 4, TRB_CL_MEM_USE_HOST_PTR = 8, TRB_CL_MEM_COPY_HOST_PTR = 32,
+  TRB_CL_MEM_SIZE = 0x1102, TRB_CL_MAP_READ = 1,
+  TRB_CL_PROGRAM_BINARY_SIZES = 0x1165, TRB_CL_PROGRAM_BINARIES = 0x1166, TRB_CL_PROGRAM_BUILD_LOG = 0x1183
+};
+
+#define TRB_CL_FUNCTIONS(X) \
+  X(int32_t, GetPlatformIDs, (uint32_t, trb_cl_platform *, uint32_t *)) \
+  X(int32_t, GetPlatformInfo, (trb_cl_platform, uint32_t, size_t, void *, size_t *)) \
+  X(int32_t, GetDeviceIDs, (trb_cl_platform, uint64_t, uint32_t, trb_cl_device_id *, uint32_t *)) \
+  X(int32_t, GetDeviceInfo, (trb_cl_device_id, uint32_t, size_t, void *, size_t *)) \
+  X(trb_cl_context, CreateContext, (const intptr_t *, uint32_t, const trb_cl_device_id *, \
+    void (TRB_CL_CALL *)(const char *, const void *, size_t, void *), void *, int32_t *)) \
+  X(int32_t, RetainContext, (trb_cl_context)) \
+  X(int32_t, ReleaseContext, (trb_cl_context)) \
+  X(trb_cl_queue, CreateCommandQueue, (trb_cl_context, trb_cl_device_id, uint64_t, int32_t *)) \
+  X(int32_t, RetainCommandQueue, (trb_cl_queue)) \
+  X(int32_t, ReleaseCommandQueue, (trb_cl_queue)) \
+  X(int32_t, GetCommandQueueInfo, (trb_cl_queue, uint32_t, size_t, void *, size_t *)) \
+  X(trb_cl_mem, CreateBuffer, (trb_cl_context, uint64_t, size_t, void *, int32_t *)) \
+  X(int32_t, ReleaseMemObject, (trb_cl_mem)) \
+  X(int32_t, GetMemObjectInfo, (trb_cl_mem, uint32_t, size_t, void *, size_t *)) \
+  X(trb_cl_program, CreateProgramWithSource, (trb_cl_context, uint32_t, const char **, const size_t *, int32_t *)) \
+  X(trb_cl_program, CreateProgramWithBinary, (trb_cl_context, uint32_t, const trb_cl_device_id *, const size_t *, \
+    const unsigned char **, int32_t *, int32_t *)) \
+  X(int32_t, BuildProgram, (trb_cl_program, uint32_t, const trb_cl_device_id *, const char *, \
+    void (TRB_CL_CALL *)(trb_cl_program, void *), void *)) \
+  X(int32_t, GetProgramInfo, (trb_cl_program, uint32_t, size_t, void *, size_t *)) \
+  X(int32_t, GetProgramBuildInfo, (trb_cl_program, trb_cl_device_id, uint32_t, size_t, void *, size_t *)) \
+  X(int32_t, ReleaseProgram, (trb_cl_program)) \
+  X(trb_cl_kernel, CreateKernel, (trb_cl_program, const char *, int32_t *)) \
+  X(int32_t, ReleaseKernel, (trb_cl_kernel)) \
+  X(int32_t, SetKernelArg, (trb_cl_kernel, uint32_t, size_t, const void *)) \
+  X(int32_t, EnqueueNDRangeKernel, (trb_cl_queue, trb_cl_kernel, uint32_t, const size_t *, const size_t *, \
+    const size_t *, uint32_t, const trb_cl_event *, trb_cl_event *)) \
+  X(int32_t, EnqueueReadBuffer, (trb_cl_queue, trb_cl_mem, uint32_t, size_t, size_t, void *, uint32_t, \
+    const trb_cl_event *, trb_cl_event *)) \
+  X(int32_t, EnqueueWriteBuffer, (trb_cl_queue, trb_cl_mem, uint32_t, size_t, size_t, const void *, uint32_t, \
+    const trb_cl_event *, trb_cl_event *)) \
+  X(int32_t, EnqueueFillBuffer, (trb_cl_queue, trb_cl_mem, const void *, size_t, size_t, size_t, uint32_t, \
+    const trb_cl_event *, trb_cl_event *)) \
+  X(void *, EnqueueMapBuffer, (trb_cl_queue, trb_cl_mem, uint32_t, uint64_t, size_t, size_t, uint32_t, \
+    const trb_cl_event *, trb_cl_event *, int32_t *)) \
+  X(int32_t, EnqueueUnmapMemObject, (trb_cl_queue, trb_cl_mem, void *, uint32_t, const trb_cl_event *, trb_cl_event *)) \
+  X(int32_t, EnqueueMarkerWithWaitList, (trb_cl_queue, uint32_t, const trb_cl_event *, trb_cl_event *)) \
+  X(int32_t, Flush, (trb_cl_queue)) \
+  X(int32_t, Finish, (trb_cl_queue))
+
+typedef struct trb_cl_api {
+  #define TRB_X(type, name, arguments) type (TRB_CL_CALL *name) arguments;
+  TRB_CL_FUNCTIONS(TRB_X)
+  #undef TRB_X
+} trb_cl_api;
+
+typedef void (*trb_cl_function)(void);
+
+/* The library stays loaded: drivers do not like to be unloaded. */
+static void *trb_cl_library(void) {
+  static const char *const names[] = {
+  #if defined(_WIN32)
+    "OpenCL.dll"
+  #elif defined(__APPLE__)
+    "/System/Library/Frameworks/OpenCL.framework/OpenCL"
+  #else
+    "libOpenCL.so.1", "libOpenCL.so"
+  #endif
+  };
+  void *library = NULL;
+  size_t i;
+  for (i = 0; i < sizeof names / sizeof names[0] && !library; i++) {
+  #if defined(_WIN32)
+    library = (void *)LoadLibraryA(names[i]);
+  #else
+    library = dlopen(names[i], RTLD_NOW | RTLD_LOCAL);
+  #endif
+  }
+  return library;
+}
+
+static trb_cl_function trb_cl_symbol(void *library, const char *name) {
+  trb_cl_function function = 0;
+#if defined(_WIN32)
+  function = (trb_cl_function)GetProcAddress((HMODULE)library, name);
+#else
+  void *symbol = dlsym(library, name);
+  memcpy(&function, &symbol, sizeof function);       /* ISO C has no cast for that */
+#endif
+  return function;
+}
+
+/* 0 where there is no OpenCL, or one before 1.2. */
+static int trb_cl_load(trb_cl_api *api, trbvh_stats *stats) {
+  void *library = NULL;
+#if !defined(_WIN32)
+  #ifdef RTLD_DEFAULT
+    void *const process = RTLD_DEFAULT;
+  #else                                  /* POSIX reserves it, not all systems show it to C99 */
+    void *const process = NULL;
+  #endif
+  if (dlsym(process, "clGetPlatformIDs")) library = process;
+  else
+#endif
+  {
+    library = trb_cl_library();
+    if (!library) {
+      trb_cl_say(stats, "there is no %s here", "OpenCL library", 0, "");
+      return 0;
+    }
+  }
+  #define TRB_X(type, name, arguments) { \
+    trb_cl_function function = trb_cl_symbol(library, "cl" #name); \
+    if (!function) { trb_cl_say(stats, "the OpenCL library has no %s", "cl" #name, 0, ""); return 0; } \
+    memcpy(&api->name, &function, sizeof function); }
+  TRB_CL_FUNCTIONS(TRB_X)
+  #undef TRB_X
+  return 1;
+}
+
+// >>kernels ---- the programs, and every kernel's arguments ----------------------------------------------------------
+#define TRB_CL_PROGRAMS(X) \
+  X(BUILD,    "-DTRB_WITH_BOUNDS -DTRB_WITH_MORTON -DTRB_WITH_SORT -DTRB_WITH_HIERARCHY -DTRB_WITH_COLLAPSE -DTRB_WITH_OUTPUT") \
+  X(SPLIT,    "-DTRB_WITH_BOUNDS -DTRB_WITH_SPLIT") \
+  X(TREELETS, "-DTRB_WITH_TREELETS") \
+  X(REFIT,    "-DTRB_WITH_REFIT -DTRB_WITH_OUTPUT") \
+  X(TRACE,    "-DTRB_WITH_TRACE")
+
+/* b: a buffer, u: uint, l: ulong; a star: work-groups of TRB_LANES. */
+#define TRB_CL_KERNELS(X) \
+  X(BUILD, read, "bbbbb")             X(BUILD, grid, "bbu")               X(BUILD, count_refs, "bbb") \
+  X(BUILD, scan, "bu")                X(BUILD, move_refs, "bbbb")         X(BUILD, return_refs, "bbb") \
+  X(SPLIT, priorities, "bbbbbb")      X(SPLIT, priority_unit, "bbu")      X(SPLIT, sum_splits, "bbbu") \
+  X(SPLIT, choose_scale, "bbuu")      X(SPLIT, count_slots, "bbbb")       X(SPLIT, split, "bbbbbbbb") \
+  X(SPLIT, sum_refs, "bbu")           X(BUILD, keys, "bbbu") \
+  X(BUILD, count_digits, "bbbu")      X(BUILD, place_digits, "bu")        X(BUILD, scatter_keys, "bbbbu") \
+  X(BUILD, sum_tiles, "bbu")          X(BUILD, scan_tiles, "bbu") \
+  X(BUILD, build_blocks, "bbbbb")     X(BUILD, build_top, "bbb") \
+  X(BUILD, build_chunks, "bbbbbbb")   X(BUILD, join_chunks, "bbbbbbbbbu") \
+  X(TREELETS, find_groups, "bbbbbu")  X(TREELETS, restructure, "bbbbu")   X(TREELETS, restructure_top, "bbbu") \
+  X(TREELETS, first_level, "bbbbu")   X(TREELETS, list_level, "bbbuu")    X(TREELETS, list_levels, "bbbuu") \
+  X(TREELETS, restructure_level, "*bbbbuu")                               X(TREELETS, restructure_levels, "*bbbbu") \
+  X(BUILD, find_tasks, "bbbbbb")      X(BUILD, count_tasks, "bbbbbb")     X(BUILD, sum_tasks, "bb") \
+  X(BUILD, emit_top, "bbbbb")         X(BUILD, emit_tasks, "bbbbb") \
+  X(BUILD, first_inner, "bbbbb")      X(BUILD, list_inner, "bbbbbbbbu")   X(BUILD, list_rest, "bbbbbbbbu") \
+  X(BUILD, count_inner, "bbbbbu")     X(BUILD, count_rest, "bbbbbu")      X(BUILD, sum_inner, "bbbb") \
+  X(BUILD, emit_root, "bbbb")         X(BUILD, emit_level, "bbbbbbbu") \
+  X(BUILD, triangles, "bbbbbu")       X(REFIT, triangles, "bbbbbu") \
+  X(REFIT, first_refit, "bbb")        X(REFIT, list_refit, "bbbu") \
+  X(REFIT, refit_leaves, "bbbbbu")    X(REFIT, refit_level, "bbbu") \
+  X(TRACE, intersect, "bbbbull")      X(TRACE, occluded, "bbbbull")
+
+enum {
+  #define TRB_X(name, options) TRB_CL_PROGRAM_##name,
+  TRB_CL_PROGRAMS(TRB_X)
+  #undef TRB_X
+  TRB_CL_PROGRAM_COUNT
+};
+enum {
+  #define TRB_X(program, name, arguments) TRB_CL_##program##_##name,
+  TRB_CL_KERNELS(TRB_X)
+  #undef TRB_X
+  TRB_CL_KERNEL_COUNT
+};
+
+#define TRB_CL_WIDE       40u            /* levels of a tree that get a launch each on a GPU */
+#define TRB_CL_GROUPS_MAX 2048u          /* in a launch whose work-items take one element after the other */
+#ifndef TRB_CL_SMALL                     /* fewer triangles are built in C */
+  #define TRB_CL_SMALL 20000u
+#endif
+#ifndef TRB_CL_SHAPE                     /* 0: by the device's type. For tests: 1 that for CPUs, 2 that for GPUs */
+  #define TRB_CL_SHAPE 0
+#endif
+
+// >>device ----------------------------------------------------------------------------------------------------------
+typedef struct trb_cl {
+  trbvh_device     hooks;                /* first: what trbvh.h knows of it */
+  trb_cl_api       api;
+  trbvh_cl_desc    desc;
+  trbvh_cl_info    info;
+  trb_cl_device_id id;
+  trb_cl_context   context;
+  trb_cl_queue     queue;
+  int              cpu, prefetches;      /* the shape of its kernels; do they understand __builtin_prefetch */
+  trb_cl_program   programs[TRB_CL_PROGRAM_COUNT];
+  trb_cl_kernel    kernels[TRB_CL_KERNEL_COUNT];
+  /* the first call that failed since the last trb_cl_begin; nothing is enqueued after it */
+  int32_t          error;
+  char             message[256];
+#ifdef TRB_CL_PROFILE                    /* for a benchmark: is told of every launch */
+  void           (*on_launch)(void *user, const char *kernel, trb_cl_event event);
+  void            *on_launch_user;
+#endif
+} trb_cl;
+
+/* Remembers the first failure. */
+static int trb_cl_check(trb_cl *cl, int32_t error, const char *call) {
+  if (error && !cl->error) {
+    cl->error = error;
+    snprintf(cl->message, sizeof cl->message, "%s failed on %.80s: error %d", call, cl->info.name, (int)error);
+  }
+  return cl->error == 0;
+}
+
+static void trb_cl_begin(trb_cl *cl) { cl->error = 0; cl->message[0] = 0; }
+
+/* What the failure is to the user. */
+static trbvh_result trb_cl_result(const trb_cl *cl, trbvh_stats *stats) {
+  if (!cl->error) return TRBVH_OK;
+  trb_cl_say(stats, "%s", cl->message, 0, "");
+  return cl->error == TRB_CL_MEM_OBJECT_ALLOCATION_FAILURE || cl->error == TRB_CL_INVALID_BUFFER_SIZE
+       ? TRBVH_OUT_OF_DEVICE_MEMORY : TRBVH_DEVICE_ERROR;
+}
+
+static trb_u64 trb_cl_hash(trb_u64 hash, const void *bytes, size_t size) {           /* FNV-1a */
+  const unsigned char *p = (const unsigned char *)bytes;
+  while (size--) hash = (hash ^ *p++) * 0x100000001B3u;
+  return hash;
+}
+#define TRB_CL_HASH_START 0xCBF29CE484222325u
+
+/* OpenCL does not cut texts off: the call fails where there is too little room. */
+static void trb_cl_device_text(const trb_cl_api *api, trb_cl_device_id id, uint32_t what, char *out, size_t size) {
+  char text[1024] = "";
+  if (api->GetDeviceInfo(id, what, sizeof text - 1, text, NULL)) text[0] = 0;
+  snprintf(out, size, "%.*s", (int)(size - 1), text);
+}
+
+/* A number; 0 where it is not known. Sizes of these differ: bool, uint, ulong, size_t. */
+static uint64_t trb_cl_device_number(const trb_cl_api *api, trb_cl_device_id id, uint32_t what) {
+  uint64_t wide = 0;
+  uint32_t narrow;
+  size_t used = 0;
+  if (api->GetDeviceInfo(id, what, sizeof wide, &wide, &used)) return 0;
+  if (used == 8) return wide;
+  memcpy(&narrow, &wide, sizeof narrow);
+  return used == 4 ? narrow : 0;
+}
+
+static void trb_cl_describe(const trb_cl_api *api, trb_cl_platform platform, trb_cl_device_id id, trbvh_cl_info *info) {
+  char text[1024] = "";
+  memset(info, 0, sizeof *info);
+  trb_cl_device_text(api, id, TRB_CL_DEVICE_NAME, info->name, sizeof info->name);
+  trb_cl_device_text(api, id, TRB_CL_DRIVER_VERSION, info->version, sizeof info->version);
+  if (api->GetPlatformInfo(platform, TRB_CL_PLATFORM_NAME, sizeof text - 1, text, NULL)) text[0] = 0;
+  snprintf(info->platform, sizeof info->platform, "%.*s", (int)sizeof info->platform - 1, text);
+  info->is_gpu = (trb_cl_device_number(api, id, TRB_CL_DEVICE_TYPE) & TRB_CL_DEVICE_TYPE_GPU) != 0;
+  info->memory_bytes = trb_cl_device_number(api, id, TRB_CL_DEVICE_GLOBAL_MEM_SIZE);
+  info->compute_units = (uint32_t)trb_cl_device_number(api, id, TRB_CL_DEVICE_MAX_COMPUTE_UNITS);
+}
+
+/* OpenCL 1.2, a compiler, our byte order, and what the kernels ask for. */
+static int trb_cl_usable(const trb_cl_api *api, trb_cl_device_id id) {
+  const uint32_t one = 1;
+  char version[64];
+  unsigned char little;
+  memcpy(&little, &one, 1);
+  trb_cl_device_text(api, id, TRB_CL_DEVICE_VERSION, version, sizeof version);       /* "OpenCL 1.2 ..." */
+  if (strncmp(version, "OpenCL ", 7) || version[7] < '1' || (version[7] == '1' && version[9] < '2')) return 0;
+  if (!(trb_cl_device_number(api, id, TRB_CL_DEVICE_TYPE) & TRB_CL_DEVICE_TYPE_CPU) &&
+      (trb_cl_device_number(api, id, TRB_CL_DEVICE_MAX_WORK_GROUP_SIZE) < TRB_GPU_GROUP ||
+       trb_cl_device_number(api, id, TRB_CL_DEVICE_LOCAL_MEM_SIZE) < 32768)) return 0;
+  return trb_cl_device_number(api, id, TRB_CL_DEVICE_AVAILABLE) &&
+         trb_cl_device_number(api, id, TRB_CL_DEVICE_COMPILER_AVAILABLE) &&
+         (trb_cl_device_number(api, id, TRB_CL_DEVICE_ENDIAN_LITTLE) != 0) == (little != 0);
+}
+
+#define TRB_CL_FOUND_MAX 32u             /* platforms, and devices of each, that are looked at */
+typedef struct trb_cl_found { trb_cl_platform platform; trb_cl_device_id id; } trb_cl_found;
+
+/* All usable devices; how many. */
+static uint32_t trb_cl_find(const trb_cl_api *api, trb_cl_found *found, uint32_t capacity) {
+  trb_cl_platform platforms[TRB_CL_FOUND_MAX];
+  trb_cl_device_id ids[TRB_CL_FOUND_MAX];
+  uint32_t platform_count = 0, device_count, count = 0, i, k;
+  if (api->GetPlatformIDs(TRB_CL_FOUND_MAX, platforms, &platform_count)) return 0;
+  for (i = 0; i < platform_count && i < TRB_CL_FOUND_MAX; i++) {
+    device_count = 0;
+    if (api->GetDeviceIDs(platforms[i], 0xFFFFFFFFu, TRB_CL_FOUND_MAX, ids, &device_count)) continue;
+    for (k = 0; k < device_count && k < TRB_CL_FOUND_MAX && count < capacity; k++)
+      if (trb_cl_usable(api, ids[k])) {
+        found[count].platform = platforms[i];
+        found[count++].id = ids[k];
+      }
+  }
+  return count;
+}
+
+TRBVH_API uint32_t trbvh_cl_devices(trbvh_cl_info *out, uint32_t capacity) {
+  trb_cl_found found[TRB_CL_FOUND_MAX];
+  trb_cl_api api;
+  uint32_t count, i;
+  if (!trb_cl_load(&api, NULL)) return 0;
+  count = trb_cl_find(&api, found, TRB_CL_FOUND_MAX);
+  for (i = 0; i < count && i < capacity && out; i++) trb_cl_describe(&api, found[i].platform, found[i].id, &out[i]);
+  return count;
+}
+
+static int trb_cl_contains(const char *text, const char *part) {     /* whatever the case */
+  size_t i, k;
+  for (i = 0; text[i]; i++) {
+    for (k = 0; part[k] && text[i + k] && (text[i + k] | 32) == (part[k] | 32); k++) {}
+    if (!part[k]) return 1;
+  }
+  return part[0] == 0;
+}
+
+/* Which of the devices: the first whose name fits, or the first GPU, or the first CPU, or the first. */
+static const trb_cl_found *trb_cl_choose(const trb_cl_api *api, const trb_cl_found *found, uint32_t count, const char *name) {
+  const trb_cl_found *best = NULL;
+  uint32_t i;
+  int best_rank = 0;
+  for (i = 0; i < count; i++) {
+    trbvh_cl_info info;
+    int rank = 1;
+    trb_cl_describe(api, found[i].platform, found[i].id, &info);
+    if (name && !trb_cl_contains(info.name, name) && !trb_cl_contains(info.platform, name)) continue;
+    if (!name && info.is_gpu) rank = 3;
+    else if (!name && trb_cl_device_number(api, found[i].id, TRB_CL_DEVICE_TYPE) & TRB_CL_DEVICE_TYPE_CPU) rank = 2;
+    if (rank > best_rank) { best = &found[i]; best_rank = rank; }
+  }
+  return best;
+}
+
+/* The context and queue: the user's, kept for as long as the device is open, or new ones. */
+static int trb_cl_open_queue(trb_cl *cl, trbvh_stats *stats) {
+  int32_t error = 0;
+  uint64_t properties = 0;
+  trb_cl_found found[TRB_CL_FOUND_MAX];
+  const trb_cl_found *chosen;
+  const char *name;
+  uint32_t count;
+  if (cl->desc.queue) {
+    trb_cl_context context = NULL;
+    trb_cl_platform platform = NULL;
+    if (cl->api.GetCommandQueueInfo(cl->desc.queue, TRB_CL_QUEUE_CONTEXT, sizeof context, &context, NULL) ||
+        cl->api.GetCommandQueueInfo(cl->desc.queue, TRB_CL_QUEUE_DEVICE, sizeof cl->id, &cl->id, NULL) ||
+        cl->api.GetCommandQueueInfo(cl->desc.queue, TRB_CL_QUEUE_PROPERTIES, sizeof properties, &properties, NULL)) {
+      trb_cl_say(stats, "%s", "desc->queue is not a command queue", 0, "");
+      return 0;
+    }
+    if (properties & TRB_CL_QUEUE_OUT_OF_ORDER || !trb_cl_usable(&cl->api, cl->id)) {
+      trb_cl_say(stats, "%s", properties & TRB_CL_QUEUE_OUT_OF_ORDER ? "desc->queue is out of order" :
+                 "the device of desc->queue lacks OpenCL 1.2 or a compiler", 0, "");
+      return 0;
+    }
+    if (cl->api.GetDeviceInfo(cl->id, TRB_CL_DEVICE_PLATFORM, sizeof platform, &platform, NULL)) return 0;
+    trb_cl_describe(&cl->api, platform, cl->id, &cl->info);
+    if (cl->api.RetainContext(context)) return 0;
+    cl->context = context;
+    if (cl->api.RetainCommandQueue(cl->desc.queue)) return 0;
+    cl->queue = cl->desc.queue;
+    return 1;
+  }
+  name = cl->desc.name ? cl->desc.name : getenv("TRBVH_CL_DEVICE");
+  if (name && !name[0]) name = NULL;
+  count = trb_cl_find(&cl->api, found, TRB_CL_FOUND_MAX);
+  chosen = trb_cl_choose(&cl->api, found, count, name);
+  if (!chosen) {
+    trb_cl_say(stats, name ? "no OpenCL device is called %.100s" : "%sthere is no usable OpenCL device", name ? name : "", 0, "");
+    return 0;
+  }
+  cl->id = chosen->id;
+  trb_cl_describe(&cl->api, chosen->platform, cl->id, &cl->info);
+  cl->context = cl->api.CreateContext(NULL, 1, &cl->id, NULL, NULL, &error);
+  if (!trb_cl_check(cl, cl->context ? error : error ? error : -6, "clCreateContext")) return 0;
+#ifdef TRB_CL_PROFILE
+  properties = TRB_CL_QUEUE_PROFILING;
+#endif
+  cl->queue = cl->api.CreateCommandQueue(cl->context, cl->id, properties, &error);
+  return trb_cl_check(cl, cl->queue ? error : error ? error : -6, "clCreateCommandQueue");
+}
+
+static trbvh_result trb_cl_build_tree(trbvh_device *device, trb_build *b, trbvh *bvh);
+static trbvh_result trb_cl_trace_batch(trbvh_device *device, trb_build *b, const trb_batch *batch);
+
+TRBVH_API trbvh_device *trbvh_cl_open(const trbvh_cl_desc *desc, trbvh_stats *stats) {
+  trb_cl_api api;
+  trb_cl *cl;
+  if (stats) memset(stats, 0, sizeof *stats);
+  if (!trb_cl_load(&api, stats)) return NULL;
+  cl = (trb_cl *)TRBVH_MALLOC(sizeof *cl);
+  if (!cl) { trb_cl_say(stats, "%s", "no memory for the device", 0, ""); return NULL; }
+  memset(cl, 0, sizeof *cl);
+  cl->hooks.build = trb_cl_build_tree;
+  cl->hooks.trace = trb_cl_trace_batch;
+  cl->api = api;
+  if (desc) cl->desc = *desc;
+  if (!trb_cl_open_queue(cl, stats)) {
+    if (cl->error) trb_cl_say(stats, "%s", cl->message, 0, "");
+    else if (stats && !stats->message[0]) trb_cl_say(stats, "%s", "the device could not be opened", 0, "");
+    trbvh_cl_close(&cl->hooks);
+    return NULL;
+  }
+  cl->cpu = TRB_CL_SHAPE ? TRB_CL_SHAPE == 1 : !cl->info.is_gpu &&
+            (trb_cl_device_number(&api, cl->id, TRB_CL_DEVICE_TYPE) & TRB_CL_DEVICE_TYPE_CPU) != 0;
+  cl->prefetches = cl->cpu && strstr(cl->info.platform, "Portable Computing Language") != NULL;
+  return &cl->hooks;
+}
+
+TRBVH_API void trbvh_cl_close(trbvh_device *device) {
+  trb_cl *cl = (trb_cl *)device;
+  uint32_t i;
+  if (!cl) return;
+  if (cl->queue) cl->api.Finish(cl->queue);
+  for (i = 0; i < TRB_CL_KERNEL_COUNT; i++) if (cl->kernels[i]) cl->api.ReleaseKernel(cl->kernels[i]);
+  for (i = 0; i < TRB_CL_PROGRAM_COUNT; i++) if (cl->programs[i]) cl->api.ReleaseProgram(cl->programs[i]);
+  if (cl->queue) cl->api.ReleaseCommandQueue(cl->queue);
+  if (cl->context) cl->api.ReleaseContext(cl->context);
+  TRBVH_FREE(cl);
+}
+
+TRBVH_API const char *trbvh_cl_name(const trbvh_device *device) {
+  return device ? ((const trb_cl *)device)->info.name : "";
+}
+
+// >>programs ---- compiled when first needed, from the user's cache or from source -----------------------------------
+static void trb_cl_cache_key(const trb_cl *cl, const char *options, char key[128]) {
+  trb_u64 hash = trb_cl_hash(TRB_CL_HASH_START, options, strlen(options));
+  hash = trb_cl_hash(hash, &cl->info, offsetof(trbvh_cl_info, is_gpu));              /* name, platform, driver */
+  snprintf(key, 128, "trbvh-%s-%08x%08x", TRB_CL_HASH, (unsigned)(hash >> 32), (unsigned)hash);
+}
+
+/* Cached bytes are a hash of what follows, and the program's binary: some drivers do not survive a damaged one. */
+static trb_cl_program trb_cl_load_program(trb_cl *cl, const char *key, const char *options) {
+  trb_cl_program program = NULL;
+  unsigned char *bytes = NULL;
+  const unsigned char *binary;
+  size_t size = cl->desc.cache_load ? cl->desc.cache_load(cl->desc.user, key, NULL, 0) : 0, binary_size;
+  trb_u64 hash;
+  int32_t status = 0, error = 0;
+  if (size <= sizeof hash || size > 1u << 30) return NULL;
+  bytes = (unsigned char *)TRBVH_MALLOC(size);
+  if (!bytes) return NULL;
+  if (cl->desc.cache_load(cl->desc.user, key, bytes, size) == size) {
+    memcpy(&hash, bytes, sizeof hash);
+    binary = bytes + sizeof hash;
+    binary_size = size - sizeof hash;
+    if (hash == trb_cl_hash(TRB_CL_HASH_START, binary, binary_size)) {
+      program = cl->api.CreateProgramWithBinary(cl->context, 1, &cl->id, &binary_size, &binary, &status, &error);
+      if (program && (error || status || cl->api.BuildProgram(program, 1, &cl->id, options, NULL, NULL))) {
+        cl->api.ReleaseProgram(program);
+        program = NULL;
+      }
+    }
+  }
+  TRBVH_FREE(bytes);
+  return program;
+}
+
+static void trb_cl_save_program(trb_cl *cl, trb_cl_program program, const char *key) {
+  size_t size = 0;
+  unsigned char *bytes, *binary;
+  trb_u64 hash;
+  if (!cl->desc.cache_save ||
+      cl->api.GetProgramInfo(program, TRB_CL_PROGRAM_BINARY_SIZES, sizeof size, &size, NULL) || !size) return;
+  bytes = (unsigned char *)TRBVH_MALLOC(size + sizeof hash);
+  if (!bytes) return;
+  binary = bytes + sizeof hash;
+  if (!cl->api.GetProgramInfo(program, TRB_CL_PROGRAM_BINARIES, sizeof binary, &binary, NULL)) {
+    hash = trb_cl_hash(TRB_CL_HASH_START, binary, size);
+    memcpy(bytes, &hash, sizeof hash);
+    cl->desc.cache_save(cl->desc.user, key, bytes, size + sizeof hash);
+  }
+  TRBVH_FREE(bytes);
+}
+
+static trb_cl_program trb_cl_compile_program(trb_cl *cl, const char *options) {
+  int32_t error = 0;
+  const char **text = (const char **)(uintptr_t)trb_cl_text;         /* OpenCL's declaration lacks a const */
+  trb_cl_program program = cl->api.CreateProgramWithSource(cl->context, TRB_CL_LINES, text, NULL, &error);
+  if (!trb_cl_check(cl, program ? error : error ? error : -6, "clCreateProgramWithSource")) return NULL;
+  error = cl->api.BuildProgram(program, 1, &cl->id, options, NULL, NULL);
+  if (error) {
+    char log[160] = "";
+    size_t used = 0, size = 0;
+    char *whole;
+    if (!cl->api.GetProgramBuildInfo(program, cl->id, TRB_CL_PROGRAM_BUILD_LOG, 0, NULL, &size) && size &&
+        (whole = (char *)TRBVH_MALLOC(size + 1)) != NULL) {
+      if (!cl->api.GetProgramBuildInfo(program, cl->id, TRB_CL_PROGRAM_BUILD_LOG, size, whole, &used)) {
+        whole[TRB_MIN(used, size)] = 0;
+        snprintf(log, sizeof log, "%s", whole);
+      }
+      TRBVH_FREE(whole);
+    }
+    if (!cl->error)
+      snprintf(cl->message, sizeof cl->message, "clBuildProgram failed: error %d: %s", (int)error, log);
+    cl->error = error;
+    cl->api.ReleaseProgram(program);
+    return NULL;
+  }
+  return program;
+}
+
+static trb_cl_program trb_cl_program_of(trb_cl *cl, int index) {
+  static const char *const parts[] = {
+    #define TRB_X(name, options) options,
+    TRB_CL_PROGRAMS(TRB_X)
+    #undef TRB_X
+  };
+  char options[256], key[128];
+  if (cl->programs[index] || cl->error) return cl->programs[index];
+  snprintf(options, sizeof options, "-cl-std=CL1.2 -DTRB_WITH_SHAPE %s %s %s", parts[index],
+           cl->cpu ? "-DTRB_CPU" : "-DTRB_GPU", cl->prefetches ? "-DTRB_CAN_PREFETCH" : "");
+  trb_cl_cache_key(cl, options, key);
+  cl->programs[index] = trb_cl_load_program(cl, key, options);
+  if (!cl->programs[index]) {
+    cl->programs[index] = trb_cl_compile_program(cl, options);
+    if (cl->programs[index]) trb_cl_save_program(cl, cl->programs[index], key);
+  }
+  return cl->programs[index];
+}
+
+#include <stdarg.h>
+/* Runs a kernel in so many work-groups; nothing after an error, nor for none. */
+static void trb_cl_launch(trb_cl *cl, int index, size_t groups, ...) {
+  static const struct { const char *name, *arguments; int program; } table[] = {
+    #define TRB_X(program, name, arguments) {"trb_k_" #name, arguments, TRB_CL_PROGRAM_##program},
+    TRB_CL_KERNELS(TRB_X)
+    #undef TRB_X
+  };
+  const char *spec = table[index].arguments;
+  size_t local = cl->cpu ? 1 : *spec == '*' ? TRB_GPU_LANES : TRB_GPU_GROUP, global;
+  trb_cl_event *wanted = NULL;
+#ifdef TRB_CL_PROFILE
+  trb_cl_event event = NULL;
+#endif
+  uint32_t i = 0;
+  int32_t error = 0;
+  va_list list;
+  if (cl->error || groups == 0) return;
+  if (!cl->kernels[index]) {
+    trb_cl_program program = trb_cl_program_of(cl, table[index].program);
+    if (!program) return;
+    cl->kernels[index] = cl->api.CreateKernel(program, table[index].name, &error);
+    if (!cl->kernels[index] && !error) error = -6;
+    if (!trb_cl_check(cl, error, "clCreateKernel")) return;
+  }
+  va_start(list, groups);
+  for (spec += *spec == '*'; *spec && !error; spec++, i++) {
+    if (*spec == 'b') {
+      trb_cl_mem buffer = va_arg(list, trb_cl_mem);
+      error = cl->api.SetKernelArg(cl->kernels[index], i, sizeof buffer, &buffer);
+    } else if (*spec == 'u') {
+      uint32_t value = va_arg(list, uint32_t);
+      error = cl->api.SetKernelArg(cl->kernels[index], i, sizeof value, &value);
+    } else {
+      uint64_t value = va_arg(list, uint64_t);
+      error = cl->api.SetKernelArg(cl->kernels[index], i, sizeof value, &value);
+    }
+  }
+  va_end(list);
+  if (!trb_cl_check(cl, error, "clSetKernelArg")) return;
+  global = groups * local;
+#ifdef TRB_CL_PROFILE
+  if (cl->on_launch) wanted = &event;
+#endif
+  error = cl->api.EnqueueNDRangeKernel(cl->queue, cl->kernels[index], 1, NULL, &global, &local, 0, NULL, wanted);
+  trb_cl_check(cl, error, table[index].name);
+#ifdef TRB_CL_PROFILE
+  if (event) cl->on_launch(cl->on_launch_user, table[index].name, event);
+#endif
+}
+
+// >>buffers ---------------------------------------------------------------------------------------------------------
+static trb_cl_mem trb_cl_buffer(trb_cl *cl, uint64_t flags, size_t size, const void *host) {
+  int32_t error = 0;
+  trb_cl_mem buffer = NULL;
+  if (cl->error) return NULL;
+  buffer = cl->api.CreateBuffer(cl->context, flags, TRB_MAX(size, 64u), (void *)(uintptr_t)host, &error);
+  if (!buffer && !error) error = TRB_CL_MEM_OBJECT_ALLOCATION_FAILURE;
+  if (error && !cl->error) {
+    cl->error = error;
+    snprintf(cl->message, sizeof cl->message, "clCreateBuffer failed on %.80s for %u MiB: error %d", cl->info.name,
+             (unsigned)(size >> 20), (int)error);
+  }
+  return buffer;
+}
+
+static void trb_cl_release(trb_cl *cl, trb_cl_mem *buffer) {
+  if (*buffer) cl->api.ReleaseMemObject(*buffer);
+  *buffer = NULL;
+}
+
+static void trb_cl_read(trb_cl *cl, trb_cl_mem buffer, void *out, size_t size) {      /* waits */
+  if (!cl->error && size)
+    trb_cl_check(cl, cl->api.EnqueueReadBuffer(cl->queue, buffer, 1, 0, size, out, 0, NULL, NULL), "clEnqueueReadBuffer");
+}
+
+static void trb_cl_write(trb_cl *cl, trb_cl_mem buffer, const void *in, size_t size) { /* waits until in may change */
+  if (!cl->error && size)
+    trb_cl_check(cl, cl->api.EnqueueWriteBuffer(cl->queue, buffer, 1, 0, size, in, 0, NULL, NULL), "clEnqueueWriteBuffer");
+}
+
+static void trb_cl_zero(trb_cl *cl, trb_cl_mem buffer, size_t size) {
+  const uint32_t zero = 0;
+  if (!cl->error && size)
+    trb_cl_check(cl, cl->api.EnqueueFillBuffer(cl->queue, buffer, &zero, sizeof zero, 0, size, 0, NULL, NULL),
+                 "clEnqueueFillBuffer");
+}
+
+static void trb_cl_flush(trb_cl *cl) { if (!cl->error) trb_cl_check(cl, cl->api.Flush(cl->queue), "clFlush"); }
+static void trb_cl_finish(trb_cl *cl) { if (!cl->error) trb_cl_check(cl, cl->api.Finish(cl->queue), "clFinish"); }
+
+/* The event that tells of all that was enqueued so far. */
+static void trb_cl_mark(trb_cl *cl, trb_cl_event *done) {
+  if (done && !cl->error)
+    trb_cl_check(cl, cl->api.EnqueueMarkerWithWaitList(cl->queue, 0, NULL, done), "clEnqueueMarkerWithWaitList");
+  trb_cl_flush(cl);
+  if (done && cl->error) *done = NULL;
+}
+
+/* Memory that host and device share on a CPU, without a copy; elsewhere a buffer of its own. */
+static trb_cl_mem trb_cl_share(trb_cl *cl, void *host, size_t size) {
+  return cl->cpu && size >= 64 ? trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE | TRB_CL_MEM_USE_HOST_PTR, size, host)
+                               : trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE, size, NULL);
+}
+
+/* Makes what a kernel wrote to such a buffer visible to the host. */
+static void trb_cl_fetch(trb_cl *cl, trb_cl_mem buffer, void *host, size_t size) {
+  int32_t error = 0;
+  void *mapped;
+  if (!cl->cpu || size < 64) { trb_cl_read(cl, buffer, host, size); return; }
+  if (cl->error) return;
+  mapped = cl->api.EnqueueMapBuffer(cl->queue, buffer, 1, TRB_CL_MAP_READ, 0, size, 0, NULL, NULL, &error);
+  if (!mapped && !error) error = -6;
+  if (trb_cl_check(cl, error, "clEnqueueMapBuffer"))
+    trb_cl_check(cl, cl->api.EnqueueUnmapMemObject(cl->queue, buffer, mapped, 0, NULL, NULL), "clEnqueueUnmapMemObject");
+  trb_cl_finish(cl);
+}
+
+/* Input that the device reads. */
+static trb_cl_mem trb_cl_input(trb_cl *cl, const void *host, size_t size) {
+  const uint64_t how = cl->cpu && size >= 64 ? TRB_CL_MEM_USE_HOST_PTR : TRB_CL_MEM_COPY_HOST_PTR;
+  trb_cl_mem buffer = NULL;
+  if (size >= 64) return trb_cl_buffer(cl, TRB_CL_MEM_READ_ONLY | how, size, host);
+  buffer = trb_cl_buffer(cl, TRB_CL_MEM_READ_ONLY, size, NULL);
+  trb_cl_write(cl, buffer, host, size);
+  return buffer;
+}
+
+// >>stages ---- a build: buffers, and the kernels of every stage in the order of trbvh.h ------------------------------
+/* Buffers are shared by what comes one after the other; R is b->ref_max:
+ *
+ *     nodes  64 R   references before splitting, and while gaps are closed   build nodes
+ *     refs   32 R   references                               CPU: treelets' lists; spare nodes of the collapse
+ *     keys    8 R   priorities   keys                        CPU: nodes above groups; spare words
+ *     sorted  8 R   sums of splits   keys   GPU: what splits wait for        spare words
+ *     counts        of tiles; of digits; of waiting splits
+ *     GPU: lists 4 R and marks 4 R: waiting splits; nodes by level, where their references begin; places 24 R
+ *     CPU: ranges, groups, tasks
+ *
+ * So that no buffer is larger than the largest array, each has its own. */
+typedef struct trb_cl_work {
+  trb_cl     *cl;
+  trb_build  *b;
+  trb_plan    plan;                      /* the host's copy */
+  trb_cl_mem  positions, indices;        /* boxes stand in positions' place */
+  int         owns_mesh;                 /* they are the build's, not the user's */
+  void       *packed;                    /* positions with another alignment than the device can read */
+  size_t      packed_size;
+  trb_cl_mem  state;                     /* the device's plan */
+  trb_cl_mem  nodes, refs, keys, sorted, counts, partials, ranges, groups, tasks, lists, marks, places, levels;
+  trb_cl_mem  out_nodes, out_prims, out_triangles;
+  uint32_t    tiles, blocks, spread;     /* work-groups for ref_max elements: tiles, blocks of C, elements in any order */
+} trb_cl_work;
+
+static uint32_t trb_cl_spread(const trb_cl *cl, uint32_t n) {
+  return cl->cpu ? trb_blocks(n, TRB_BLOCK) : TRB_MIN(trb_blocks(n, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX);
+}
+
+/* The words counts holds: tiles' counts, the sort's, twice those of hierarchy chunks. */
+static size_t trb_cl_count_words(const trb_cl_work *w) {
+  const size_t tiles = w->tiles;
+  return w->cl->cpu ? (size_t)trb_blocks(w->b->ref_max, TRB_SORT_BLOCK) * TRB_DIGITS + 2 * tiles
+                    : 256 * tiles + 2 * trb_blocks(w->b->ref_max, TRB_GPU_CHUNK) + 64;
+}
+
+static void trb_cl_make_buffers(trb_cl_work *w) {
+  const size_t n = w->b->ref_max;
+  trb_cl *cl = w->cl;
+  w->blocks = trb_blocks(w->b->ref_max, TRB_BLOCK);
+  w->tiles = trb_blocks(w->b->ref_max, cl->cpu ? TRB_BLOCK : TRB_GPU_TILE);
+  w->spread = trb_cl_spread(cl, w->b->ref_max);
+  #define TRB_X(member, bytes) \
+    w->member = trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE, bytes, NULL); \
+    w->b->stats.bytes_scratch += bytes;
+  TRB_X(state,    sizeof(trb_plan))
+  TRB_X(nodes,    n * 2 * sizeof(trbvh_node))
+  TRB_X(refs,     n * sizeof(trbvh_node))
+  TRB_X(keys,     n * 8)
+  TRB_X(sorted,   n * 8)
+  TRB_X(counts,   trb_cl_count_words(w) * 4)
+  TRB_X(partials, (size_t)w->spread * TRB_MAX(sizeof(trb_partial), TRB_CANDIDATES * 8))
+  if (cl->cpu) {
+    TRB_X(ranges, (size_t)w->blocks * sizeof(trb_range))
+    TRB_X(groups, (size_t)w->blocks * sizeof(trb_group))
+    TRB_X(tasks,  TRB_TASKS_MAX(n) * sizeof(trb_task))
+  } else {
+    TRB_X(lists,  n * 4)
+    TRB_X(marks,  n * 4)
+    TRB_X(places, n * sizeof(trb_place))
+    TRB_X(levels, TRB_GPU_LEVELS * sizeof(trb_level))
+  }
+  #undef TRB_X
+}
+
+/* After the commands that use them: OpenCL keeps them until then. */
+static void trb_cl_free_buffers(trb_cl_work *w) {
+  trb_cl_mem *scratch[] = {&w->state, &w->nodes, &w->refs, &w->keys, &w->sorted, &w->counts, &w->partials, &w->ranges,
+                           &w->groups, &w->tasks, &w->lists, &w->marks, &w->places, &w->levels};
+  size_t i;
+  for (i = 0; i < sizeof scratch / sizeof scratch[0]; i++) trb_cl_release(w->cl, scratch[i]);
+  if (w->owns_mesh) {
+    trb_cl_release(w->cl, &w->positions);
+    trb_cl_release(w->cl, &w->indices);
+  }
+  trb_free(&w->b->options.allocator, w->packed, w->packed_size);
+}
+
+static void trb_cl_free_output(trb_cl_work *w) {
+  trb_cl_release(w->cl, &w->out_nodes);
+  trb_cl_release(w->cl, &w->out_prims);
+  trb_cl_release(w->cl, &w->out_triangles);
+}
+
+/* What the kernels need to know; positions' layout on the device is in the plan already. */
+static void trb_cl_send_plan(trb_cl_work *w) {
+  const trb_build *b = w->b;
+  trb_plan *p = &w->plan;
+  p->costs = b->costs;
+  p->form = b->key_form;
+  p->cost_node = b->options.cost_node;
+  p->cost_prim = b->options.cost_prim;
+  p->prim_count = b->input.count;
+  p->boxes = b->input.boxes != NULL;
+  p->split_max = b->split_max;
+  p->index_size = b->input.indices ? b->input.index_size : 0;
+  p->position_count = b->input.position_count;
+  trb_cl_write(w->cl, w->state, p, sizeof *p);
+}
+
+/* ---- References ---- */
+static void trb_cl_read_mesh(trb_cl_work *w) {
+  trb_cl *cl = w->cl;
+  const uint32_t groups = trb_cl_spread(cl, w->b->input.count);
+  trb_cl_launch(cl, TRB_CL_BUILD_read, groups, w->state, w->positions, w->indices, w->b->split_max ? w->nodes : w->refs,
+                w->partials);
+  trb_cl_launch(cl, TRB_CL_BUILD_grid, 1, w->state, w->partials, groups);
+}
+
+static void trb_cl_split(trb_cl_work *w) {
+  trb_cl *cl = w->cl;
+  const uint32_t groups = trb_cl_spread(cl, w->b->input.count);
+  const uint32_t tiles = trb_blocks(w->b->input.count, cl->cpu ? TRB_BLOCK : TRB_GPU_TILE);
+  uint32_t step;
+  trb_cl_launch(cl, TRB_CL_SPLIT_priorities, groups, w->state, w->positions, w->indices, w->nodes, w->keys, w->partials);
+  trb_cl_launch(cl, TRB_CL_SPLIT_priority_unit, 1, w->state, w->partials, groups);
+  for (step = TRB_CANDIDATES * TRB_CANDIDATES; step; step /= TRB_CANDIDATES) {       /* TRB_SCALES: less than 16^3 */
+    trb_cl_launch(cl, TRB_CL_SPLIT_sum_splits, groups, w->state, w->keys, w->partials, step);
+    trb_cl_launch(cl, TRB_CL_SPLIT_choose_scale, 1, w->state, w->partials, step, groups);
+  }
+  trb_cl_launch(cl, TRB_CL_SPLIT_count_slots, tiles, w->state, w->nodes, w->keys, w->counts);
+  trb_cl_launch(cl, TRB_CL_BUILD_scan, 1, w->counts, tiles);
+  trb_cl_launch(cl, TRB_CL_SPLIT_split, tiles, w->state, w->positions, w->indices, w->nodes, w->keys, w->counts, w->refs,
+                w->sorted);
+  trb_cl_launch(cl, TRB_CL_SPLIT_sum_refs, 1, w->state, w->sorted, tiles);
+}
+
+static void trb_cl_close_gaps(trb_cl_work *w) {
+  trb_cl *cl = w->cl;
+  trb_cl_launch(cl, TRB_CL_BUILD_count_refs, w->tiles, w->state, w->refs, w->counts);
+  trb_cl_launch(cl, TRB_CL_BUILD_scan, 1, w->counts, w->tiles);
+  trb_cl_launch(cl, TRB_CL_BUILD_move_refs, w->tiles, w->state, w->refs, w->counts, w->nodes);
+  trb_cl_launch(cl, TRB_CL_BUILD_return_refs, w->spread, w->state, w->nodes, w->refs);
+}
+
+/* ---- Keys and their sort ---- */
+static void trb_cl_sort(trb_cl_work *w, uint32_t shift, uint32_t bits) {
+  trb_cl *cl = w->cl;
+  const uint32_t end = shift + bits, digit_bits = cl->cpu ? TRB_DIGIT_BITS : 8;
+  const uint32_t blocks = cl->cpu ? trb_blocks(w->b->ref_max, TRB_SORT_BLOCK) : w->tiles;
+  const uint32_t counters = 256 * blocks, counter_tiles = trb_blocks(counters, TRB_GPU_TILE);
+  for (; shift < end; shift += digit_bits) {
+    trb_cl_mem swap = w->keys;
+    trb_cl_launch(cl, TRB_CL_BUILD_count_digits, blocks, w->state, w->keys, w->counts, shift);
+    if (cl->cpu) {
+      trb_cl_launch(cl, TRB_CL_BUILD_place_digits, 1, w->counts, blocks);
+    } else {
+      trb_cl_launch(cl, TRB_CL_BUILD_sum_tiles, counter_tiles, w->counts, w->marks, counters);
+      trb_cl_launch(cl, TRB_CL_BUILD_scan, 1, w->marks, counter_tiles);
+      trb_cl_launch(cl, TRB_CL_BUILD_scan_tiles, counter_tiles, w->counts, w->marks, counters);
+    }
+    trb_cl_launch(cl, TRB_CL_BUILD_scatter_keys, blocks, w->state, w->keys, w->counts, w->sorted, shift);
+    w->keys = w->sorted;
+    w->sorted = swap;
+  }
+}
+
+static void trb_cl_make_keys(trb_cl_work *w, uint32_t high) {
+  trb_cl_launch(w->cl, TRB_CL_BUILD_keys, w->spread, w->state, w->refs, w->keys, high);
+}
+
+static void trb_cl_sort_keys(trb_cl_work *w) {
+  const trb_key_form form = w->b->key_form;
+  trb_cl_sort(w, form.shift, form.bits);
+  if (form.packed) return;
+  trb_cl_make_keys(w, 1);
+  trb_cl_sort(w, 32, 32);
+}
+
+/* ---- Hierarchy ---- */
+static void trb_cl_build_hierarchy(trb_cl_work *w) {
+  trb_cl *cl = w->cl;
+  uint32_t size = TRB_GPU_CHUNK, chunks = trb_blocks(w->b->ref_max, size);
+  trb_cl_mem from = w->lists, to = w->marks, counts = w->counts, next_counts = w->places, swap;
+  if (cl->cpu) {
+    trb_cl_launch(cl, TRB_CL_BUILD_build_blocks, w->blocks, w->state, w->keys, w->refs, w->nodes, w->ranges);
+    trb_cl_launch(cl, TRB_CL_BUILD_build_top, 1, w->state, w->nodes, w->ranges);
+    return;
+  }
+  trb_cl_zero(cl, w->sorted, (size_t)w->b->ref_max * sizeof(trb_wait));
+  trb_cl_launch(cl, TRB_CL_BUILD_build_chunks, chunks, w->state, w->keys, w->refs, w->nodes, w->sorted, from, counts);
+  while (chunks > 1) {
+    chunks = trb_blocks(chunks, TRB_GPU_CHUNKS);
+    trb_cl_launch(cl, TRB_CL_BUILD_join_chunks, chunks, w->state, w->keys, w->refs, w->nodes, w->sorted, from, counts, to,
+                  next_counts, size);
+    size *= TRB_GPU_CHUNKS;
+    swap = from; from = to; to = swap;
+    swap = counts; counts = next_counts; next_counts = swap;
+  }
+}
+
+/* ---- Treelets ---- */
+/* Work-groups for one level on a GPU: of n nodes, and no more than two to this power. */
+static uint32_t trb_cl_level_groups(uint32_t level, uint32_t n, uint32_t group) {
+  n = level < 31 ? TRB_MIN(n, 1u << level) : n;
+  return trb_blocks(n, group);
+}
+
+static void trb_cl_round(trb_cl_work *w, uint32_t gamma) {
+  const uint32_t launch_max = 1u << 20;              /* roots: no launch longer than a watchdog's patience */
+  const uint32_t roots = w->b->ref_max / gamma;      /* of one level, at most */
+  trb_cl *cl = w->cl;
+  uint32_t level, begin;
+  if (cl->cpu) {
+    trb_cl_launch(cl, TRB_CL_TREELETS_find_groups, 1, w->state, w->nodes, w->keys, w->refs, w->groups, gamma);
+    trb_cl_launch(cl, TRB_CL_TREELETS_restructure, w->blocks, w->state, w->nodes, w->refs, w->groups, gamma);
+    trb_cl_launch(cl, TRB_CL_TREELETS_restructure_top, 1, w->state, w->nodes, w->refs, gamma);
+    return;
+  }
+  trb_cl_launch(cl, TRB_CL_TREELETS_first_level, 1, w->state, w->nodes, w->levels, w->lists, gamma);
+  for (level = 0; level < TRB_CL_WIDE; level++) {
+    uint32_t groups = TRB_MIN(trb_cl_level_groups(level, roots, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX);
+    trb_cl_launch(cl, TRB_CL_TREELETS_list_level, groups, w->nodes, w->levels, w->lists, gamma, level);
+  }
+  trb_cl_launch(cl, TRB_CL_TREELETS_list_levels, 1, w->nodes, w->levels, w->lists, gamma, TRB_CL_WIDE);
+  trb_cl_launch(cl, TRB_CL_TREELETS_restructure_levels, 1, w->state, w->nodes, w->levels, w->lists, TRB_CL_WIDE);
+  for (level = TRB_CL_WIDE; level-- > 0;)
+    for (begin = 0; begin < roots && (begin == 0 || level >= 20); begin += launch_max) {
+      uint32_t groups = trb_cl_level_groups(level, TRB_MIN(roots - begin, launch_max), TRB_GPU_LANES);
+      trb_cl_launch(cl, TRB_CL_TREELETS_restructure_level, groups, w->state, w->nodes, w->levels, w->lists, level, begin);
+    }
+}
+
+/* ---- Collapse ---- */
+static void trb_cl_count_tree(trb_cl_work *w) {
+  trb_cl *cl = w->cl;
+  const uint32_t inner = w->b->ref_max / 2;          /* of one level, at most */
+  uint32_t level;
+  if (cl->cpu) {
+    trb_cl_launch(cl, TRB_CL_BUILD_find_tasks, 1, w->state, w->nodes, w->refs, w->keys, w->sorted, w->tasks);
+    trb_cl_launch(cl, TRB_CL_BUILD_count_tasks, 2 * w->blocks, w->state, w->nodes, w->refs, w->keys, w->sorted, w->tasks);
+    trb_cl_launch(cl, TRB_CL_BUILD_sum_tasks, 1, w->state, w->tasks);
+    return;
+  }
+  trb_cl_launch(cl, TRB_CL_BUILD_first_inner, 1, w->state, w->nodes, w->levels, w->lists, w->marks);
+  for (level = 0; level < TRB_CL_WIDE; level++)
+    trb_cl_launch(cl, TRB_CL_BUILD_list_inner, TRB_MIN(trb_cl_level_groups(level, inner, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX),
+                  w->state, w->nodes, w->refs, w->keys, w->sorted, w->levels, w->lists, w->marks, level);
+  trb_cl_launch(cl, TRB_CL_BUILD_list_rest, 1, w->state, w->nodes, w->refs, w->keys, w->sorted, w->levels, w->lists,
+                w->marks, TRB_CL_WIDE);
+  trb_cl_launch(cl, TRB_CL_BUILD_count_rest, 1, w->state, w->nodes, w->levels, w->lists, w->places, TRB_CL_WIDE);
+  for (level = TRB_CL_WIDE; level-- > 0;)
+    trb_cl_launch(cl, TRB_CL_BUILD_count_inner, TRB_MIN(trb_cl_level_groups(level, inner, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX),
+                  w->state, w->nodes, w->levels, w->lists, w->places, level);
+  trb_cl_launch(cl, TRB_CL_BUILD_sum_inner, 1, w->state, w->nodes, w->levels, w->places);
+}
+
+/* Into the buffers for the result. */
+static void trb_cl_emit_tree(trb_cl_work *w) {
+  trb_cl *cl = w->cl;
+  uint32_t level;
+  if (cl->cpu) {
+    trb_cl_launch(cl, TRB_CL_BUILD_emit_top, 1, w->state, w->nodes, w->tasks, w->out_nodes, w->out_prims);
+    trb_cl_launch(cl, TRB_CL_BUILD_emit_tasks, w->plan.tasks, w->state, w->nodes, w->tasks, w->out_nodes, w->out_prims);
+    return;
+  }
+  trb_cl_launch(cl, TRB_CL_BUILD_emit_root, 1, w->state, w->nodes, w->out_nodes, w->out_prims);
+  for (level = 0; level < w->plan.max_depth; level++)
+    trb_cl_launch(cl, TRB_CL_BUILD_emit_level,
+                  TRB_MIN(trb_cl_level_groups(level, w->b->ref_max / 2, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX),
+                  w->state, w->nodes, w->levels, w->lists, w->places, w->out_nodes, w->out_prims, level);
+}
+
+static void trb_cl_make_triangles(trb_cl_work *w) {
+  if (w->out_triangles)
+    trb_cl_launch(w->cl, TRB_CL_BUILD_triangles, trb_cl_spread(w->cl, w->plan.prims), w->state, w->positions, w->indices,
+                  w->out_prims, w->out_triangles, w->plan.prims);
+}
+
+/* ---- All of it ---- */
+/* Ends a stage: its time, where somebody wants to know it and so waits; and the progress report. */
+static trbvh_result trb_cl_end_stage(trb_cl_work *w, float share, double *ms, double *start) {
+  const int waits = w->b->options.stats || w->b->options.progress;
+  if (waits) trb_cl_finish(w->cl);
+  else trb_cl_flush(w->cl);
+  *ms += trb_ms() - *start;
+  *start = trb_ms();
+  if (w->cl->error) return trb_cl_result(w->cl, &w->b->stats);
+  return trb_stage(&w->b->runner, share) ? TRBVH_CANCELLED : TRBVH_OK;
+}
+#define TRB_CL_STAGE(share, ms, call) \
+  if (!result) { \
+    call; \
+    result = trb_cl_end_stage(w, share, &w->b->stats.ms, &start); \
+  }
+
+/* Everything up to the size of the result; then w->plan has the counts. */
+static trbvh_result trb_cl_run_to_counts(trb_cl_work *w) {
+  const trb_build *b = w->b;
+  const trb_plan *p = &w->plan;
+  trbvh_result result;
+  double start = trb_ms();
+  int32_t round;
+  trb_cl_make_buffers(w);
+  trb_cl_send_plan(w);
+  result = trb_cl_end_stage(w, 0.05f, &w->b->stats.ms_transfer, &start);
+  TRB_CL_STAGE(0.05f, ms_morton, trb_cl_read_mesh(w))
+  if (b->split_max) { TRB_CL_STAGE(0.1f, ms_split, trb_cl_split(w)) }
+  TRB_CL_STAGE(0.05f, ms_morton, (trb_cl_close_gaps(w), trb_cl_make_keys(w, 0)))
+  TRB_CL_STAGE(0.1f, ms_sort, trb_cl_sort_keys(w))
+  TRB_CL_STAGE(0.1f, ms_hierarchy, trb_cl_build_hierarchy(w))
+  for (round = 0; round < b->options.treelet_rounds && round < TRB_ROUNDS_MAX; round++) {
+    uint32_t gamma = (uint32_t)TRB_TREELET << round;
+    if (gamma > b->ref_max) break;
+    TRB_CL_STAGE(0.1f, ms_treelets, trb_cl_round(w, gamma))
+  }
+  TRB_CL_STAGE(0.1f, ms_collapse, (trb_cl_count_tree(w), trb_cl_read(w->cl, w->state, &w->plan, sizeof w->plan)))
+  if (result) return result;
+  if (p->bad != TRBVH_NONE)
+    return trb_fail(w->b, TRBVH_BAD_GEOMETRY, "triangle %u uses vertex %u, but there are %u", p->bad, p->bad_vertex,
+                    b->input.position_count);
+  w->b->stats.skipped_count = p->skipped;
+  w->b->stats.max_depth = p->max_depth;
+  w->b->stats.sah_cost = p->root_area > 0 ? (double)p->sah / (double)p->root_area : 0;
+  return TRBVH_OK;
+}
+
+static trbvh_result trb_cl_run_to_end(trb_cl_work *w) {
+  trbvh_result result = TRBVH_OK;
+  double start = trb_ms();
+  TRB_CL_STAGE(0.1f, ms_collapse, trb_cl_emit_tree(w))
+  TRB_CL_STAGE(0.1f, ms_finish, trb_cl_make_triangles(w))
+  return result;
+}
+
+// >>host ---- trbvh_build and the batch queries on a device -----------------------------------------------------------
+/* The mesh as the device can read it: floats must be aligned there. */
+static trbvh_result trb_cl_send_mesh(trb_cl_work *w) {
+  const trbvh_geometry *g = &w->b->input;
+  const char *data = (const char *)(g->boxes ? g->boxes : g->positions);
+  const size_t element = g->boxes ? 24 : 12, stride = g->boxes ? g->box_stride : g->position_stride;
+  const size_t count = g->boxes ? g->count : g->indices ? g->position_count : (size_t)g->count * 3;
+  size_t i;
+  w->owns_mesh = 1;
+  w->plan.position_stride = stride;
+  if ((uintptr_t)data % 4 || stride % 4) {
+    w->packed_size = count * element;
+    w->packed = trb_alloc(&w->b->options.allocator, w->packed_size);
+    if (!w->packed)
+      return trb_fail(w->b, TRBVH_OUT_OF_MEMORY, "no memory to pack the positions: %u MiB", (unsigned)(w->packed_size >> 20), 0, 0);
+    for (i = 0; i < count; i++) memcpy((char *)w->packed + i * element, data + i * stride, element);
+    data = (const char *)w->packed;
+    w->plan.position_stride = element;
+  }
+  w->positions = trb_cl_input(w->cl, data, (count - 1) * (size_t)w->plan.position_stride + element);
+  if (g->indices) {
+    const size_t size = (size_t)g->count * 3 * g->index_size;
+    if ((uintptr_t)g->indices % g->index_size == 0) {
+      w->indices = trb_cl_input(w->cl, g->indices, size);
+    } else {
+      w->indices = trb_cl_buffer(w->cl, TRB_CL_MEM_READ_ONLY, size, NULL);
+      trb_cl_write(w->cl, w->indices, g->indices, size);
+    }
+  }
+  return trb_cl_result(w->cl, &w->b->stats);
+}
+
+/* The tree, in the block that trb_make_room has made. */
+static trbvh_result trb_cl_write_block(trb_cl_work *w) {
+  trbvh *tree = &w->b->tree;
+  trb_cl *cl = w->cl;
+  trbvh_result result;
+  double start;
+  const size_t nodes_size = (size_t)tree->node_count * sizeof(trbvh_node), prims_size = (size_t)tree->ref_count * 4;
+  const size_t triangles_size = tree->triangles ? (size_t)tree->ref_count * sizeof(trbvh_triangle) : 0;
+  void *nodes = (void *)(uintptr_t)tree->nodes, *prims = (void *)(uintptr_t)tree->prims;
+  void *triangles = (void *)(uintptr_t)tree->triangles;
+  w->out_nodes = trb_cl_share(cl, nodes, nodes_size);
+  w->out_prims = trb_cl_share(cl, prims, prims_size);
+  if (triangles) w->out_triangles = trb_cl_share(cl, triangles, triangles_size);
+  result = trb_cl_run_to_end(w);
+  if (result) return result;
+  start = trb_ms();
+  trb_cl_fetch(cl, w->out_nodes, nodes, nodes_size);
+  trb_cl_fetch(cl, w->out_prims, prims, prims_size);
+  if (triangles) trb_cl_fetch(cl, w->out_triangles, triangles, triangles_size);
+  w->b->stats.ms_transfer += trb_ms() - start;
+  return trb_cl_result(cl, &w->b->stats);
+}
+
+static trbvh_result trb_cl_build_tree(trbvh_device *device, trb_build *b, trbvh *bvh) {
+  trb_cl *cl = (trb_cl *)device;
+  trb_cl_work work, *w = &work;
+  trbvh_result result;
+  double start = trb_ms();
+  if (b->input.count < TRB_CL_SMALL && !(b->options.flags & TRBVH_NO_FALLBACK))
+    return trb_fail(b, TRBVH_NO_DEVICE, "built in C: %u primitives are too few to be worth a launch", b->input.count, 0, 0);
+  memset(w, 0, sizeof *w);
+  w->cl = cl;
+  w->b = b;
+  trb_cl_begin(cl);
+  result = trb_cl_send_mesh(w);
+  b->stats.ms_transfer += trb_ms() - start;
+  if (!result) result = trb_cl_run_to_counts(w);
+  if (!result && w->plan.leaves) {
+    result = trb_make_room(b, bvh, w->plan.leaves, w->plan.prims);
+    if (!result) result = trb_cl_write_block(w);
+    /* float's range was too small for the areas */
+    if (!result && !(w->plan.root_area > 1e-30f && w->plan.sah < FLT_MAX))
+      b->stats.sah_cost = trbvh_sah(&b->tree, b->options.cost_node > 0 ? b->options.cost_node : -1,
+                                    b->options.cost_prim > 0 ? b->options.cost_prim : -1);
+  }
+  if (result) cl->api.Finish(cl->queue);             /* before memory that it shares goes */
+  trb_cl_free_output(w);
+  trb_cl_free_buffers(w);
+  return result;
+}
+
+/* Rays in launches of so many: see trb_cl_round. */
+#define TRB_CL_RAYS_MAX ((uint64_t)1 << 20)
+
+static void trb_cl_trace(trb_cl *cl, int kernel, const trbvh_cl_tree *tree, trb_cl_mem rays, trb_cl_mem out, uint64_t count) {
+  uint64_t begin, end;
+  for (begin = 0; begin < count; begin = end) {
+    end = TRB_MIN(count, begin + TRB_CL_RAYS_MAX);
+    trb_cl_launch(cl, kernel, trb_blocks((uint32_t)(end - begin), cl->cpu ? 64 : TRB_GPU_GROUP), tree->nodes,
+                  tree->triangles, rays, out, (uint32_t)(tree->node_count == 0), begin, end);
+    trb_cl_flush(cl);
+  }
+}
+
+static trbvh_result trb_cl_trace_batch(trbvh_device *device, trb_build *b, const trb_batch *batch) {
+  trb_cl *cl = (trb_cl *)device;
+  const trbvh *bvh = batch->bvh;
+  const size_t out_size = batch->count * (batch->hits ? sizeof(trbvh_hit) : 1);
+  void *out = batch->hits ? (void *)batch->hits : (void *)batch->occluded;
+  trbvh_cl_tree tree = {0};
+  trb_cl_mem rays, result;
+  if (batch->count < TRB_CL_SMALL && !(b->options.flags & TRBVH_NO_FALLBACK))
+    return trb_fail(b, TRBVH_NO_DEVICE, "traced in C: %u rays are too few to be worth a launch", (unsigned)batch->count, 0, 0);
+  trb_cl_begin(cl);
+  tree.node_count = bvh->node_count;
+  if (tree.node_count) {
+    tree.nodes = trb_cl_input(cl, bvh->nodes, (size_t)bvh->node_count * sizeof(trbvh_node));
+    tree.triangles = trb_cl_input(cl, bvh->triangles, (size_t)bvh->ref_count * sizeof(trbvh_triangle));
+  }
+  rays = trb_cl_input(cl, batch->rays, batch->count * sizeof(trbvh_ray));
+  result = trb_cl_share(cl, out, out_size);
+  trb_stage(&b->runner, 1);
+  trb_cl_trace(cl, batch->hits ? TRB_CL_TRACE_intersect : TRB_CL_TRACE_occluded, &tree, rays, result, batch->count);
+  trb_cl_fetch(cl, result, out, out_size);
+  if (cl->error) cl->api.Finish(cl->queue);
+  trb_cl_release(cl, &tree.nodes);
+  trb_cl_release(cl, &tree.triangles);
+  trb_cl_release(cl, &rays);
+  trb_cl_release(cl, &result);
+  if (cl->error) return trb_cl_result(cl, &b->stats);
+  return trb_stage(&b->runner, 0) ? TRBVH_CANCELLED : TRBVH_OK;
+}
+
+// >>resident --------------------------------------------------------------------------------------------------------
+static size_t trb_cl_size(trb_cl *cl, trb_cl_mem buffer) {
+  size_t size = 0;
+  trb_cl_check(cl, cl->api.GetMemObjectInfo(buffer, TRB_CL_MEM_SIZE, sizeof size, &size, NULL), "clGetMemObjectInfo");
+  return size;
+}
+
+/* Fills in what a build needs to know of a mesh in device memory. */
+static trbvh_result trb_cl_take_mesh(trb_cl_work *w, const trbvh_cl_geometry *geometry) {
+  const trbvh_geometry *g = &w->b->input;
+  const size_t vertices = g->indices ? g->position_count : (size_t)g->count * 3;
+  const size_t positions_end = geometry->position_offset + (vertices - 1) * g->position_stride + 12;
+  const size_t indices_end = g->indices ? geometry->index_offset + (size_t)g->count * 3 * g->index_size : 0;
+  if (geometry->position_offset % 4 || g->position_stride % 4)
+    return trb_fail(w->b, TRBVH_INVALID_ARGUMENT, "position_offset and position_stride must be multiples of 4", 0, 0, 0);
+  if (g->indices && geometry->index_offset % g->index_size)
+    return trb_fail(w->b, TRBVH_INVALID_ARGUMENT, "index_offset must be a multiple of index_size", 0, 0, 0);
+  if (trb_cl_size(w->cl, geometry->positions) < positions_end && !w->cl->error)
+    return trb_fail(w->b, TRBVH_INVALID_ARGUMENT, "the buffer of positions is too small", 0, 0, 0);
+  if (g->indices && trb_cl_size(w->cl, geometry->indices) < indices_end && !w->cl->error)
+    return trb_fail(w->b, TRBVH_INVALID_ARGUMENT, "the buffer of indices is too small", 0, 0, 0);
+  w->positions = geometry->positions;
+  w->indices = geometry->indices;
+  w->plan.position_offset = geometry->position_offset;
+  w->plan.position_stride = g->position_stride;
+  w->plan.index_offset = geometry->index_offset;
+  return trb_cl_result(w->cl, &w->b->stats);
+}
+
+/* The same checks as for a mesh in host memory, whose pointers the buffers stand for. */
+static trbvh_result trb_cl_resolve(trb_cl_work *w, trbvh_device *device, const trbvh_cl_geometry *geometry,
+                                   const trbvh_options *options) {
+  trbvh_geometry g;
+  trbvh_result result;
+  memset(&g, 0, sizeof g);
+  if (geometry) {
+    g.positions = geometry->positions;
+    g.position_stride = geometry->position_stride;
+    g.position_count = geometry->position_count;
+    g.indices = geometry->indices;
+    g.index_size = geometry->index_size;
+    g.count = geometry->count;
+  }
+  memset(&w->plan, 0, sizeof w->plan);
+  result = trb_resolve(w->b, geometry ? &g : NULL, options);
+  if (!device) return trb_fail(w->b, TRBVH_NO_DEVICE, "device is NULL", 0, 0, 0);
+  trb_cl_begin(w->cl);
+  if (!result && g.count) result = trb_cl_take_mesh(w, geometry);
+  return result;
+}
+
+static void trb_cl_run_resident(trb_cl_work *w, trbvh_cl_tree *tree, trbvh_result *result) {
+  trb_cl *cl = w->cl;
+  *result = trb_cl_run_to_counts(w);
+  if (*result || !w->plan.leaves) return;
+  w->out_nodes = trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE, (size_t)w->plan.leaves * 2 * sizeof(trbvh_node), NULL);
+  w->out_prims = trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE, (size_t)w->plan.prims * 4, NULL);
+  if (!(w->b->options.flags & TRBVH_NO_TRIANGLES))
+    w->out_triangles = trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE, (size_t)w->plan.prims * sizeof(trbvh_triangle), NULL);
+  *result = trb_cl_run_to_end(w);
+  if (*result) return;
+  tree->nodes = w->out_nodes;
+  tree->prims = w->out_prims;
+  tree->triangles = w->out_triangles;
+  w->out_nodes = w->out_prims = w->out_triangles = NULL;
+  tree->node_count = 2 * w->plan.leaves;
+  tree->ref_count = w->plan.prims;
+  w->b->stats.node_count = tree->node_count;
+  w->b->stats.leaf_count = w->plan.leaves;
+  w->b->stats.ref_count = tree->ref_count;
+  w->b->stats.bytes_result = (size_t)w->plan.leaves * 2 * sizeof(trbvh_node) +
+                             (size_t)w->plan.prims * (4 + (tree->triangles ? sizeof(trbvh_triangle) : 0));
+}
+
+TRBVH_API trbvh_result trbvh_cl_build(trbvh_device *device, trbvh_cl_tree *tree, const trbvh_cl_geometry *geometry,
+                                      const trbvh_options *options, struct _cl_event **done) {
+  trb_build b;
+  trb_cl_work work, *w = &work;
+  double start = trb_ms();
+  trbvh_result result;
+  memset(w, 0, sizeof *w);
+  w->cl = (trb_cl *)device;
+  w->b = &b;
+  if (done) *done = NULL;
+  result = trb_cl_resolve(w, device, geometry, options);
+  if (!tree) result = trb_fail(&b, TRBVH_INVALID_ARGUMENT, "tree is NULL", 0, 0, 0);
+  if (tree && device) trbvh_cl_free(device, tree);
+  if (!result && b.input.count) {
+    trb_runner_start(&b.runner, &b.options, 0);
+    trb_cl_run_resident(w, tree, &result);
+    trb_runner_stop(&b.runner);
+    trb_cl_free_output(w);
+    trb_cl_free_buffers(w);
+  }
+  if (!result) {
+    tree->prim_count = b.input.count;
+    trb_cl_mark(w->cl, done);
+    result = trb_cl_result(w->cl, &b.stats);
+    if (result) trbvh_cl_free(device, tree);
+  }
+  if (result && !b.stats.message[0]) trb_fail(&b, result, trbvh_result_text(result), 0, 0, 0);
+  b.stats.on_device = result == TRBVH_OK;
+  b.stats.ms_total = trb_ms() - start;
+  if (options && options->stats) *options->stats = b.stats;
+  return result;
+}
+
+TRBVH_API trbvh_result trbvh_cl_refit(trbvh_device *device, trbvh_cl_tree *tree, const trbvh_cl_geometry *geometry,
+                                      struct _cl_event **done) {
+  trb_build b;
+  trb_cl_work work, *w = &work;
+  trb_cl *cl = (trb_cl *)device;
+  trbvh_result result;
+  uint32_t level;
+  memset(w, 0, sizeof *w);
+  w->cl = cl;
+  w->b = &b;
+  if (done) *done = NULL;
+  result = trb_cl_resolve(w, device, geometry, NULL);
+  if (!result && (!tree || tree->prim_count != b.input.count)) result = TRBVH_INVALID_ARGUMENT;
+  if (result) return result;
+  if (tree->node_count) {
+    const uint32_t pairs = tree->node_count / 2;
+    w->state = trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE, sizeof(trb_plan), NULL);
+    w->lists = trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE, (size_t)pairs * 4, NULL);
+    w->levels = trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE, TRB_GPU_LEVELS * sizeof(trb_level), NULL);
+    trb_cl_send_plan(w);
+    if (tree->triangles)
+      trb_cl_launch(cl, TRB_CL_REFIT_triangles, trb_cl_spread(cl, tree->ref_count), w->state, w->positions, w->indices,
+                    tree->prims, tree->triangles, tree->ref_count);
+    trb_cl_launch(cl, TRB_CL_REFIT_refit_leaves, trb_cl_spread(cl, tree->node_count), w->state, w->positions, w->indices,
+                  tree->prims, tree->nodes, tree->node_count);
+    trb_cl_launch(cl, TRB_CL_REFIT_first_refit, 1, tree->nodes, w->levels, w->lists);
+    for (level = 0; level < TRBVH_MAX_DEPTH; level++)
+      trb_cl_launch(cl, TRB_CL_REFIT_list_refit, TRB_MIN(trb_cl_level_groups(level, pairs, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX),
+                    tree->nodes, w->levels, w->lists, level);
+    for (level = TRBVH_MAX_DEPTH; level-- > 0;)
+      trb_cl_launch(cl, TRB_CL_REFIT_refit_level, TRB_MIN(trb_cl_level_groups(level, pairs, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX),
+                    tree->nodes, w->levels, w->lists, level);
+    trb_cl_free_buffers(w);
+  }
+  trb_cl_mark(cl, done);
+  return trb_cl_result(cl, NULL);
+}
+
+static trbvh_result trb_cl_query(trbvh_device *device, int kernel, const trbvh_cl_tree *tree, trb_cl_mem rays, trb_cl_mem out,
+                                 size_t count, trb_cl_event *done) {
+  trb_cl *cl = (trb_cl *)device;
+  if (done) *done = NULL;
+  if (!cl) return TRBVH_NO_DEVICE;
+  if (!tree || (count && (!rays || !out)) || (tree->node_count && !tree->triangles)) return TRBVH_INVALID_ARGUMENT;
+  trb_cl_begin(cl);
+  trb_cl_trace(cl, kernel, tree, rays, out, count);
+  trb_cl_mark(cl, done);
+  return trb_cl_result(cl, NULL);
+}
+
+TRBVH_API trbvh_result trbvh_cl_intersect(trbvh_device *device, const trbvh_cl_tree *tree, struct _cl_mem *rays,
+                                          struct _cl_mem *hits, size_t count, struct _cl_event **done) {
+  return trb_cl_query(device, TRB_CL_TRACE_intersect, tree, rays, hits, count, done);
+}
+
+TRBVH_API trbvh_result trbvh_cl_occluded(trbvh_device *device, const trbvh_cl_tree *tree, struct _cl_mem *rays,
+                                         struct _cl_mem *occluded, size_t count, struct _cl_event **done) {
+  return trb_cl_query(device, TRB_CL_TRACE_occluded, tree, rays, occluded, count, done);
+}
+
+TRBVH_API trbvh_result trbvh_cl_upload(trbvh_device *device, trbvh_cl_tree *tree, const trbvh *bvh) {
+  trb_cl *cl = (trb_cl *)device;
+  if (!cl) return TRBVH_NO_DEVICE;
+  if (!tree || !bvh) return TRBVH_INVALID_ARGUMENT;
+  trbvh_cl_free(device, tree);
+  trb_cl_begin(cl);
+  if (bvh->node_count) {
+    tree->nodes = trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE, (size_t)bvh->node_count * sizeof(trbvh_node), NULL);
+    tree->prims = trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE, (size_t)bvh->ref_count * 4, NULL);
+    trb_cl_write(cl, tree->nodes, bvh->nodes, (size_t)bvh->node_count * sizeof(trbvh_node));
+    trb_cl_write(cl, tree->prims, bvh->prims, (size_t)bvh->ref_count * 4);
+  }
+  if (bvh->triangles) {
+    tree->triangles = trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE, (size_t)bvh->ref_count * sizeof(trbvh_triangle), NULL);
+    trb_cl_write(cl, tree->triangles, bvh->triangles, (size_t)bvh->ref_count * sizeof(trbvh_triangle));
+  }
+  tree->node_count = bvh->node_count;
+  tree->ref_count = bvh->ref_count;
+  tree->prim_count = bvh->prim_count;
+  if (cl->error) trbvh_cl_free(device, tree);
+  return trb_cl_result(cl, NULL);
+}
+
+TRBVH_API trbvh_result trbvh_cl_download(trbvh_device *device, const trbvh_cl_tree *tree, trbvh *bvh,
+                                         const trbvh_options *options) {
+  trb_cl *cl = (trb_cl *)device;
+  trb_build b;
+  trbvh_geometry none;
+  trbvh_result result;
+  memset(&none, 0, sizeof none);
+  result = trb_resolve(&b, &none, options);
+  if (!cl) result = trb_fail(&b, TRBVH_NO_DEVICE, "device is NULL", 0, 0, 0);
+  else if (!tree || !bvh) result = trb_fail(&b, TRBVH_INVALID_ARGUMENT, "tree or bvh is NULL", 0, 0, 0);
+  if (!result) {
+    trb_cl_begin(cl);
+    if (!tree->triangles) b.options.flags |= TRBVH_NO_TRIANGLES;
+    if (tree->node_count) result = trb_make_room(&b, bvh, tree->node_count / 2, tree->ref_count);
+    if (!result && tree->node_count) {
+      trb_cl_read(cl, tree->nodes, (void *)(uintptr_t)b.tree.nodes, (size_t)tree->node_count * sizeof(trbvh_node));
+      trb_cl_read(cl, tree->prims, (void *)(uintptr_t)b.tree.prims, (size_t)tree->ref_count * 4);
+      if (tree->triangles)
+        trb_cl_read(cl, tree->triangles, (void *)(uintptr_t)b.tree.triangles, (size_t)tree->ref_count * sizeof(trbvh_triangle));
+      result = trb_cl_result(cl, &b.stats);
+    }
+  }
+  if (!result) trb_hand_over(&b, bvh, tree->prim_count);
+  else if (bvh) trbvh_free(bvh);
+  if (options && options->stats) *options->stats = b.stats;
+  return result;
+}
+
+TRBVH_API void trbvh_cl_free(trbvh_device *device, trbvh_cl_tree *tree) {
+  trb_cl *cl = (trb_cl *)device;
+  if (!cl || !tree) return;
+  trb_cl_release(cl, &tree->nodes);
+  trb_cl_release(cl, &tree->prims);
+  trb_cl_release(cl, &tree->triangles);
+  memset(tree, 0, sizeof *tree);
+}
+#endif /* !TRBVH_NO_OPENCL */
+#endif /* TRBVH_IMPLEMENTATION */
