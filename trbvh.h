@@ -263,7 +263,7 @@ TRBVH_API trbvh_result trbvh_occluded_n (const trbvh *bvh, const trbvh_ray *rays
 #endif
 
 #ifdef TRBVH_OPENCL_C
-  #define TRB_CORE   static inline __attribute__((unused))
+  #define TRB_CORE   static inline __attribute__((always_inline, unused))
   #define TRB_SHARED static __attribute__((unused))
   #define TRB_GLOBAL __global
   typedef ulong trb_u64;
@@ -1751,6 +1751,7 @@ TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbv
 #define TRB_GPU_CHUNK   1024u            /* leaves over which one group builds the hierarchy ... */
 #define TRB_GPU_CHUNKS  16u              /* ... and so many chunks that the next one joins */
 #define TRB_GPU_LEVELS  128u             /* more than any tree has; they are listed one by one on a GPU */
+#define TRB_JOB_STEP    64u              /* every so many-th work-group of a CPU gets a heavy job */
 #define TRB_CANDIDATES  16u              /* scales tried at once */
 
 /* One lies in the device's memory while a build runs there. */

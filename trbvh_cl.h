@@ -65,6 +65,7 @@ TRBVH_API uint32_t      trbvh_cl_devices(trbvh_cl_info *out, uint32_t capacity);
 TRBVH_API trbvh_device *trbvh_cl_open   (const trbvh_cl_desc *desc, trbvh_stats *stats);   /* NULL = none (stats->message says why): passing NULL on builds in scalar C. Both may be NULL */
 TRBVH_API void          trbvh_cl_close  (trbvh_device *device);                            /* waits for it; NULL is fine. Trees of it are freed before */
 TRBVH_API const char   *trbvh_cl_name   (const trbvh_device *device);                      /* never NULL */
+TRBVH_API void          trbvh_cl_trim   (trbvh_device *device);                            /* frees the scratch memory, some 120 to 144 bytes a reference, that a device keeps from build to build; waits */
 
 // >>resident ---- buffers in, tree out, nothing copied to the host ---------------------------------------------------
 /* A mesh in device memory, as trbvh_geometry's. Offsets, strides in bytes: multiples of 4, of index_size for indices.
@@ -151,7 +152,7 @@ static const char *const trb_cl_text[] = {
   "#line 255 \"trbvh.h\"\n",
   "  #pragma OPENCL FP_CONTRACT OFF\n",
   "#line 266 \"trbvh.h\"\n",
-  "  #define TRB_CORE   static inline __attribute__((unused))\n",
+  "  #define TRB_CORE   static inline __attribute__((always_inline, unused))\n",
   "  #define TRB_SHARED static __attribute__((unused))\n",
   "  #define TRB_GLOBAL __global\n",
   "  typedef ulong trb_u64;\n",
@@ -1511,6 +1512,7 @@ static const char *const trb_cl_text[] = {
   "#define TRB_GPU_CHUNK   1024u\n",
   "#define TRB_GPU_CHUNKS  16u\n",
   "#define TRB_GPU_LEVELS  128u\n",
+  "#define TRB_JOB_STEP    64u\n",
   "#define TRB_CANDIDATES  16u\n",
   "\n",
   "\n",
@@ -1589,6 +1591,14 @@ static const char *const trb_cl_text[] = {
   "#else\n",
   "  #define TRB_FOR(i, n) for (i = (uint)get_global_id(0); i < (n); i += (uint)get_global_size(0))\n",
   "#endif\n",
+  "#ifdef TRB_CPU\n",
+  "\n",
+  "\n",
+  "#define TRB_FOR_JOBS(i, n) \\\n",
+  "  for (i = TRB_GROUP_ID / TRB_JOB_STEP; TRB_GROUP_ID % TRB_JOB_STEP == 0 && i < (n); \\\n",
+  "       i += (uint)get_num_groups(0) / TRB_JOB_STEP)\n",
+  "#endif\n",
+  "\n",
   "\n",
   "static uint trb_scan(uint value, __local uint *space, uint *total) {\n",
   "#ifdef TRB_CPU\n",
@@ -1625,7 +1635,7 @@ static const char *const trb_cl_text[] = {
   "  mesh.count = plan->prim_count;\n",
   "  return mesh;\n",
   "}\n",
-  "#line 70 \"kernels/shape.cl\"\n",
+  "#line 78 \"kernels/shape.cl\"\n",
   "static uint trb_reserve(volatile __global uint *end, uint count, __local uint *space) {\n",
   "#ifdef TRB_CPU\n",
   "  return count ? atomic_add(end, count) : 0;\n",
@@ -2025,9 +2035,10 @@ static const char *const trb_cl_text[] = {
   "TRB_KERNEL trb_k_build_blocks(const __global trb_plan *plan, const __global ulong *keys, const __global trbvh_node *refs,\n",
   "                              __global trbvh_node *nodes, __global trb_range *ranges) {\n",
   "  const trb_curve curve = trb_plan_curve(plan, keys, refs);\n",
-  "  const uint first = TRB_GROUP_ID * TRB_BLOCK;\n",
-  "  if (first < curve.count)\n",
-  "    trb_build_block(&curve, first, min(curve.count, first + TRB_BLOCK), plan->costs, nodes, &ranges[TRB_GROUP_ID]);\n",
+  "  const uint blocks = curve.count ? (curve.count - 1) / TRB_BLOCK + 1 : 0;\n",
+  "  uint i;\n",
+  "  TRB_FOR_JOBS(i, blocks)\n",
+  "    trb_build_block(&curve, i * TRB_BLOCK, min(curve.count, (i + 1) * TRB_BLOCK), plan->costs, nodes, &ranges[i]);\n",
   "}\n",
   "\n",
   "TRB_KERNEL trb_k_build_top(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_range *ranges) {\n",
@@ -2035,7 +2046,7 @@ static const char *const trb_cl_text[] = {
   "  if (count) trb_build_top(nodes, ranges, (count - 1) / TRB_BLOCK + 1, plan->costs);\n",
   "}\n",
   "#else\n",
-  "#line 38 \"kernels/hierarchy.cl\"\n",
+  "#line 39 \"kernels/hierarchy.cl\"\n",
   "static void trb_hang(const trb_curve *curve, __global trbvh_node *nodes, __global trb_wait *waits, trbvh_node node,\n",
   "                     uint first, uint last) {\n",
   "  const ulong left = trb_split_after(curve, first - 1), right = trb_split_after(curve, last);\n",
@@ -2153,7 +2164,8 @@ static const char *const trb_cl_text[] = {
   "\n",
   "TRB_KERNEL trb_k_restructure(const __global trb_plan *plan, __global trbvh_node *nodes, __global uint *lists,\n",
   "                             const __global trb_group *groups, uint gamma) {\n",
-  "  if (TRB_GROUP_ID < plan->groups) trb_restructure_group(nodes, lists, groups[TRB_GROUP_ID], gamma, plan->costs);\n",
+  "  uint i;\n",
+  "  TRB_FOR_JOBS(i, plan->groups) trb_restructure_group(nodes, lists, groups[i], gamma, plan->costs);\n",
   "}\n",
   "\n",
   "TRB_KERNEL trb_k_restructure_top(const __global trb_plan *plan, __global trbvh_node *nodes, __global uint *lists, uint gamma) {\n",
@@ -2287,7 +2299,7 @@ static const char *const trb_cl_text[] = {
   "                             __global uint *keys, __global uint *sorted, __global trb_task *tasks) {\n",
   "  const trb_collapser c = trb_plan_collapser(plan, nodes, spare, keys, sorted);\n",
   "  uint i;\n",
-  "  for (i = TRB_GROUP_ID; i < plan->tasks; i += (uint)get_num_groups(0)) trb_count_task(&c, &tasks[i]);\n",
+  "  TRB_FOR_JOBS(i, plan->tasks) trb_count_task(&c, &tasks[i]);\n",
   "}\n",
   "\n",
   "TRB_KERNEL trb_k_sum_tasks(__global trb_plan *plan, const __global trb_task *tasks) {\n",
@@ -2316,7 +2328,7 @@ static const char *const trb_cl_text[] = {
   "                            __global trbvh_node *out, __global uint *prims) {\n",
   "  const trb_collapser c = trb_plan_emitter(plan, nodes, out, prims);\n",
   "  uint i;\n",
-  "  for (i = TRB_GROUP_ID; i < plan->tasks; i += (uint)get_num_groups(0)) trb_emit_task(&c, tasks[i]);\n",
+  "  TRB_FOR_JOBS(i, plan->tasks) trb_emit_task(&c, tasks[i]);\n",
   "}\n",
   "#else\n",
   "\n",
@@ -2614,9 +2626,9 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "#endif\n",
 };
-#define TRB_CL_CORE_LINES 1456u   /* entries of trb_cl_text for user kernels: types, core, traversal */
-#define TRB_CL_LINES      2501u   /* all entries */
-#define TRB_CL_HASH       "728b75d7533a4da1"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_CORE_LINES 1457u   /* entries of trb_cl_text for user kernels: types, core, traversal */
+#define TRB_CL_LINES      2512u   /* all entries */
+#define TRB_CL_HASH       "999f8f238d8c1f6d"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
@@ -2637,6 +2649,7 @@ TRBVH_API trbvh_device *trbvh_cl_open(const trbvh_cl_desc *desc, trbvh_stats *st
 }
 TRBVH_API void trbvh_cl_close(trbvh_device *device) { (void)device; }
 TRBVH_API const char *trbvh_cl_name(const trbvh_device *device) { (void)device; return ""; }
+TRBVH_API void trbvh_cl_trim(trbvh_device *device) { (void)device; }
 TRBVH_API trbvh_result trbvh_cl_build(trbvh_device *device, trbvh_cl_tree *tree, const trbvh_cl_geometry *geometry,
                                       const trbvh_options *options, struct _cl_event **done) {
   (void)device; (void)tree; (void)geometry; (void)options; (void)done;
@@ -2873,6 +2886,18 @@ enum {
 #endif
 
 // >>device ----------------------------------------------------------------------------------------------------------
+/* Scratch memory: see >>stages. */
+#define TRB_CL_SCRATCH(X) \
+  X(state) X(nodes) X(refs) X(keys) X(sorted) X(counts) X(partials) X(ranges) X(groups) X(tasks) X(lists) X(marks) \
+  X(places) X(levels)
+enum {
+  #define TRB_X(name) TRB_CL_SCRATCH_##name,
+  TRB_CL_SCRATCH(TRB_X)
+  #undef TRB_X
+  TRB_CL_SCRATCH_COUNT
+};
+typedef struct trb_cl_part { trb_cl_mem buffer; void *host; size_t size; } trb_cl_part;
+
 typedef struct trb_cl {
   trbvh_device     hooks;                /* first: what trbvh.h knows of it */
   trb_cl_api       api;
@@ -2884,6 +2909,7 @@ typedef struct trb_cl {
   int              cpu, prefetches;      /* the shape of its kernels; do they understand __builtin_prefetch */
   trb_cl_program   programs[TRB_CL_PROGRAM_COUNT];
   trb_cl_kernel    kernels[TRB_CL_KERNEL_COUNT];
+  trb_cl_part      scratch[TRB_CL_SCRATCH_COUNT];    /* kept from build to build */
   /* the first call that failed since the last trb_cl_begin; nothing is enqueued after it */
   int32_t          error;
   char             message[256];
@@ -3074,6 +3100,13 @@ static int trb_cl_open_queue(trb_cl *cl, trbvh_stats *stats) {
 static trbvh_result trb_cl_build_tree(trbvh_device *device, trb_build *b, trbvh *bvh);
 static trbvh_result trb_cl_trace_batch(trbvh_device *device, trb_build *b, const trb_batch *batch);
 
+/* Is the shape for CPUs the right one? Not for Mesa's, which calls itself a CPU, but runs kernels as a GPU's driver does:
+ * several work-items in a vector, and no loop of more than 65,535 steps. */
+static int trb_cl_is_cpu(const trb_cl *cl) {
+  const uint64_t type = trb_cl_device_number(&cl->api, cl->id, TRB_CL_DEVICE_TYPE);
+  return type & TRB_CL_DEVICE_TYPE_CPU && !(type & TRB_CL_DEVICE_TYPE_GPU) && !strstr(cl->info.name, "llvmpipe");
+}
+
 TRBVH_API trbvh_device *trbvh_cl_open(const trbvh_cl_desc *desc, trbvh_stats *stats) {
   trb_cl_api api;
   trb_cl *cl;
@@ -3092,8 +3125,7 @@ TRBVH_API trbvh_device *trbvh_cl_open(const trbvh_cl_desc *desc, trbvh_stats *st
     trbvh_cl_close(&cl->hooks);
     return NULL;
   }
-  cl->cpu = TRB_CL_SHAPE ? TRB_CL_SHAPE == 1 : !cl->info.is_gpu &&
-            (trb_cl_device_number(&api, cl->id, TRB_CL_DEVICE_TYPE) & TRB_CL_DEVICE_TYPE_CPU) != 0;
+  cl->cpu = TRB_CL_SHAPE ? TRB_CL_SHAPE == 1 : trb_cl_is_cpu(cl);
   cl->prefetches = cl->cpu && strstr(cl->info.platform, "Portable Computing Language") != NULL;
   return &cl->hooks;
 }
@@ -3102,7 +3134,7 @@ TRBVH_API void trbvh_cl_close(trbvh_device *device) {
   trb_cl *cl = (trb_cl *)device;
   uint32_t i;
   if (!cl) return;
-  if (cl->queue) cl->api.Finish(cl->queue);
+  trbvh_cl_trim(device);
   for (i = 0; i < TRB_CL_KERNEL_COUNT; i++) if (cl->kernels[i]) cl->api.ReleaseKernel(cl->kernels[i]);
   for (i = 0; i < TRB_CL_PROGRAM_COUNT; i++) if (cl->programs[i]) cl->api.ReleaseProgram(cl->programs[i]);
   if (cl->queue) cl->api.ReleaseCommandQueue(cl->queue);
@@ -3282,6 +3314,41 @@ static void trb_cl_release(trb_cl *cl, trb_cl_mem *buffer) {
   *buffer = NULL;
 }
 
+static void trb_cl_drop(trb_cl *cl, trb_cl_part *part) {
+  if (part->host) cl->api.Finish(cl->queue);         /* the device may be at work in it */
+  trb_cl_release(cl, &part->buffer);
+  if (part->host) TRBVH_FREE(part->host);
+  memset(part, 0, sizeof *part);
+}
+
+TRBVH_API void trbvh_cl_trim(trbvh_device *device) {
+  trb_cl *cl = (trb_cl *)device;
+  uint32_t i;
+  if (!cl) return;
+  if (cl->queue) cl->api.Finish(cl->queue);
+  for (i = 0; i < TRB_CL_SCRATCH_COUNT; i++) trb_cl_drop(cl, &cl->scratch[i]);
+}
+
+/* One part of the scratch memory, of this size or more. On a CPU it comes from where the C code's comes from, for the
+ * sake of large pages. */
+static trb_cl_mem trb_cl_scratch(trb_cl *cl, int index, size_t size) {
+  trb_cl_part *part = &cl->scratch[index];
+  if (cl->error || (part->buffer && part->size >= size)) return part->buffer;
+  trb_cl_drop(cl, part);
+  if (cl->cpu) {
+    part->host = TRBVH_MALLOC(size + TRB_LINE);
+    if (!part->host) {
+      trb_cl_check(cl, TRB_CL_MEM_OBJECT_ALLOCATION_FAILURE, "the allocation of scratch memory");
+      return NULL;
+    }
+    part->buffer = trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE | TRB_CL_MEM_USE_HOST_PTR, size, trb_align(part->host));
+  } else {
+    part->buffer = trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE, size, NULL);
+  }
+  part->size = size;
+  return part->buffer;
+}
+
 static void trb_cl_read(trb_cl *cl, trb_cl_mem buffer, void *out, size_t size) {      /* waits */
   if (!cl->error && size)
     trb_cl_check(cl, cl->api.EnqueueReadBuffer(cl->queue, buffer, 1, 0, size, out, 0, NULL, NULL), "clEnqueueReadBuffer");
@@ -3350,7 +3417,7 @@ static trb_cl_mem trb_cl_input(trb_cl *cl, const void *host, size_t size) {
  *     GPU: lists 4 R and marks 4 R: waiting splits; nodes by level, where their references begin; places 24 R
  *     CPU: ranges, groups, tasks
  *
- * So that no buffer is larger than the largest array, each has its own. */
+ * So that no buffer is larger than the largest array, each has its own. The device keeps them for the next build. */
 typedef struct trb_cl_work {
   trb_cl     *cl;
   trb_build  *b;
@@ -3383,7 +3450,7 @@ static void trb_cl_make_buffers(trb_cl_work *w) {
   w->tiles = trb_blocks(w->b->ref_max, cl->cpu ? TRB_BLOCK : TRB_GPU_TILE);
   w->spread = trb_cl_spread(cl, w->b->ref_max);
   #define TRB_X(member, bytes) \
-    w->member = trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE, bytes, NULL); \
+    w->member = trb_cl_scratch(cl, TRB_CL_SCRATCH_##member, bytes); \
     w->b->stats.bytes_scratch += bytes;
   TRB_X(state,    sizeof(trb_plan))
   TRB_X(nodes,    n * 2 * sizeof(trbvh_node))
@@ -3403,14 +3470,11 @@ static void trb_cl_make_buffers(trb_cl_work *w) {
     TRB_X(levels, TRB_GPU_LEVELS * sizeof(trb_level))
   }
   #undef TRB_X
+  if (cl->error) trbvh_cl_trim(&cl->hooks);          /* somebody else may need it more */
 }
 
-/* After the commands that use them: OpenCL keeps them until then. */
-static void trb_cl_free_buffers(trb_cl_work *w) {
-  trb_cl_mem *scratch[] = {&w->state, &w->nodes, &w->refs, &w->keys, &w->sorted, &w->counts, &w->partials, &w->ranges,
-                           &w->groups, &w->tasks, &w->lists, &w->marks, &w->places, &w->levels};
-  size_t i;
-  for (i = 0; i < sizeof scratch / sizeof scratch[0]; i++) trb_cl_release(w->cl, scratch[i]);
+/* After the commands that use it: OpenCL keeps buffers until then. */
+static void trb_cl_free_mesh(trb_cl_work *w) {
   if (w->owns_mesh) {
     trb_cl_release(w->cl, &w->positions);
     trb_cl_release(w->cl, &w->indices);
@@ -3515,7 +3579,7 @@ static void trb_cl_build_hierarchy(trb_cl_work *w) {
   uint32_t size = TRB_GPU_CHUNK, chunks = trb_blocks(w->b->ref_max, size);
   trb_cl_mem from = w->lists, to = w->marks, counts = w->counts, next_counts = w->places, swap;
   if (cl->cpu) {
-    trb_cl_launch(cl, TRB_CL_BUILD_build_blocks, w->blocks, w->state, w->keys, w->refs, w->nodes, w->ranges);
+    trb_cl_launch(cl, TRB_CL_BUILD_build_blocks, w->blocks * TRB_JOB_STEP, w->state, w->keys, w->refs, w->nodes, w->ranges);
     trb_cl_launch(cl, TRB_CL_BUILD_build_top, 1, w->state, w->nodes, w->ranges);
     return;
   }
@@ -3545,7 +3609,7 @@ static void trb_cl_round(trb_cl_work *w, uint32_t gamma) {
   uint32_t level, begin;
   if (cl->cpu) {
     trb_cl_launch(cl, TRB_CL_TREELETS_find_groups, 1, w->state, w->nodes, w->keys, w->refs, w->groups, gamma);
-    trb_cl_launch(cl, TRB_CL_TREELETS_restructure, w->blocks, w->state, w->nodes, w->refs, w->groups, gamma);
+    trb_cl_launch(cl, TRB_CL_TREELETS_restructure, w->blocks * TRB_JOB_STEP, w->state, w->nodes, w->refs, w->groups, gamma);
     trb_cl_launch(cl, TRB_CL_TREELETS_restructure_top, 1, w->state, w->nodes, w->refs, gamma);
     return;
   }
@@ -3570,7 +3634,7 @@ static void trb_cl_count_tree(trb_cl_work *w) {
   uint32_t level;
   if (cl->cpu) {
     trb_cl_launch(cl, TRB_CL_BUILD_find_tasks, 1, w->state, w->nodes, w->refs, w->keys, w->sorted, w->tasks);
-    trb_cl_launch(cl, TRB_CL_BUILD_count_tasks, 2 * w->blocks, w->state, w->nodes, w->refs, w->keys, w->sorted, w->tasks);
+    trb_cl_launch(cl, TRB_CL_BUILD_count_tasks, 2 * w->blocks * TRB_JOB_STEP, w->state, w->nodes, w->refs, w->keys, w->sorted, w->tasks);
     trb_cl_launch(cl, TRB_CL_BUILD_sum_tasks, 1, w->state, w->tasks);
     return;
   }
@@ -3593,7 +3657,7 @@ static void trb_cl_emit_tree(trb_cl_work *w) {
   uint32_t level;
   if (cl->cpu) {
     trb_cl_launch(cl, TRB_CL_BUILD_emit_top, 1, w->state, w->nodes, w->tasks, w->out_nodes, w->out_prims);
-    trb_cl_launch(cl, TRB_CL_BUILD_emit_tasks, w->plan.tasks, w->state, w->nodes, w->tasks, w->out_nodes, w->out_prims);
+    trb_cl_launch(cl, TRB_CL_BUILD_emit_tasks, w->plan.tasks * TRB_JOB_STEP, w->state, w->nodes, w->tasks, w->out_nodes, w->out_prims);
     return;
   }
   trb_cl_launch(cl, TRB_CL_BUILD_emit_root, 1, w->state, w->nodes, w->out_nodes, w->out_prims);
@@ -3648,6 +3712,10 @@ static trbvh_result trb_cl_run_to_counts(trb_cl_work *w) {
   }
   TRB_CL_STAGE(0.1f, ms_collapse, (trb_cl_count_tree(w), trb_cl_read(w->cl, w->state, &w->plan, sizeof w->plan)))
   if (result) return result;
+  if (p->ref_count > b->ref_max || p->prims > p->ref_count || p->leaves > p->prims || p->max_depth > TRBVH_MAX_DEPTH ||
+      p->skipped > b->input.count || (p->ref_count == 0) != (p->leaves == 0))
+    return trb_fail(w->b, TRBVH_DEVICE_ERROR, "the device miscalculates: %u references, %u leaves, depth %u", p->ref_count,
+                    p->leaves, p->max_depth);
   if (p->bad != TRBVH_NONE)
     return trb_fail(w->b, TRBVH_BAD_GEOMETRY, "triangle %u uses vertex %u, but there are %u", p->bad, p->bad_vertex,
                     b->input.position_count);
@@ -3744,7 +3812,7 @@ static trbvh_result trb_cl_build_tree(trbvh_device *device, trb_build *b, trbvh 
   }
   if (result) cl->api.Finish(cl->queue);             /* before memory that it shares goes */
   trb_cl_free_output(w);
-  trb_cl_free_buffers(w);
+  trb_cl_free_mesh(w);
   return result;
 }
 
@@ -3882,7 +3950,7 @@ TRBVH_API trbvh_result trbvh_cl_build(trbvh_device *device, trbvh_cl_tree *tree,
     trb_cl_run_resident(w, tree, &result);
     trb_runner_stop(&b.runner);
     trb_cl_free_output(w);
-    trb_cl_free_buffers(w);
+    trb_cl_free_mesh(w);
   }
   if (!result) {
     tree->prim_count = b.input.count;
@@ -3913,9 +3981,9 @@ TRBVH_API trbvh_result trbvh_cl_refit(trbvh_device *device, trbvh_cl_tree *tree,
   if (result) return result;
   if (tree->node_count) {
     const uint32_t pairs = tree->node_count / 2;
-    w->state = trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE, sizeof(trb_plan), NULL);
-    w->lists = trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE, (size_t)pairs * 4, NULL);
-    w->levels = trb_cl_buffer(cl, TRB_CL_MEM_READ_WRITE, TRB_GPU_LEVELS * sizeof(trb_level), NULL);
+    w->state = trb_cl_scratch(cl, TRB_CL_SCRATCH_state, sizeof(trb_plan));
+    w->lists = trb_cl_scratch(cl, TRB_CL_SCRATCH_lists, (size_t)pairs * 4);
+    w->levels = trb_cl_scratch(cl, TRB_CL_SCRATCH_levels, TRB_GPU_LEVELS * sizeof(trb_level));
     trb_cl_send_plan(w);
     if (tree->triangles)
       trb_cl_launch(cl, TRB_CL_REFIT_triangles, trb_cl_spread(cl, tree->ref_count), w->state, w->positions, w->indices,
@@ -3929,7 +3997,6 @@ TRBVH_API trbvh_result trbvh_cl_refit(trbvh_device *device, trbvh_cl_tree *tree,
     for (level = TRBVH_MAX_DEPTH; level-- > 0;)
       trb_cl_launch(cl, TRB_CL_REFIT_refit_level, TRB_MIN(trb_cl_level_groups(level, pairs, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX),
                     tree->nodes, w->levels, w->lists, level);
-    trb_cl_free_buffers(w);
   }
   trb_cl_mark(cl, done);
   return trb_cl_result(cl, NULL);

@@ -47,7 +47,7 @@ TRB_KERNEL trb_k_count_tasks(const __global trb_plan *plan, __global trbvh_node 
                              __global uint *keys, __global uint *sorted, __global trb_task *tasks) {
   const trb_collapser c = trb_plan_collapser(plan, nodes, spare, keys, sorted);
   uint i;
-  for (i = TRB_GROUP_ID; i < plan->tasks; i += (uint)get_num_groups(0)) trb_count_task(&c, &tasks[i]);
+  TRB_FOR_JOBS(i, plan->tasks) trb_count_task(&c, &tasks[i]);
 }
 
 TRB_KERNEL trb_k_sum_tasks(__global trb_plan *plan, const __global trb_task *tasks) {
@@ -76,7 +76,7 @@ TRB_KERNEL trb_k_emit_tasks(const __global trb_plan *plan, __global trbvh_node *
                             __global trbvh_node *out, __global uint *prims) {
   const trb_collapser c = trb_plan_emitter(plan, nodes, out, prims);
   uint i;
-  for (i = TRB_GROUP_ID; i < plan->tasks; i += (uint)get_num_groups(0)) trb_emit_task(&c, tasks[i]);
+  TRB_FOR_JOBS(i, plan->tasks) trb_emit_task(&c, tasks[i]);
 }
 #else
 /* Inner nodes are listed level by level; their sums go from the bottom up, their places from the top down. */

@@ -15,9 +15,10 @@ static trb_curve trb_plan_curve(const __global trb_plan *plan, const __global ul
 TRB_KERNEL trb_k_build_blocks(const __global trb_plan *plan, const __global ulong *keys, const __global trbvh_node *refs,
                               __global trbvh_node *nodes, __global trb_range *ranges) {
   const trb_curve curve = trb_plan_curve(plan, keys, refs);
-  const uint first = TRB_GROUP_ID * TRB_BLOCK;
-  if (first < curve.count)
-    trb_build_block(&curve, first, min(curve.count, first + TRB_BLOCK), plan->costs, nodes, &ranges[TRB_GROUP_ID]);
+  const uint blocks = curve.count ? (curve.count - 1) / TRB_BLOCK + 1 : 0;
+  uint i;
+  TRB_FOR_JOBS(i, blocks)
+    trb_build_block(&curve, i * TRB_BLOCK, min(curve.count, (i + 1) * TRB_BLOCK), plan->costs, nodes, &ranges[i]);
 }
 
 TRB_KERNEL trb_k_build_top(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_range *ranges) {

@@ -25,6 +25,14 @@
 #else
   #define TRB_FOR(i, n) for (i = (uint)get_global_id(0); i < (n); i += (uint)get_global_size(0))
 #endif
+#ifdef TRB_CPU
+/* Heavy jobs, one every TRB_JOB_STEP work-groups, those between being empty: CPU runtimes hand out work-groups in long
+ * rows, at first half of them to one of two threads, and few heavy ones would be dealt out unevenly. */
+#define TRB_FOR_JOBS(i, n) \
+  for (i = TRB_GROUP_ID / TRB_JOB_STEP; TRB_GROUP_ID % TRB_JOB_STEP == 0 && i < (n); \
+       i += (uint)get_num_groups(0) / TRB_JOB_STEP)
+#endif
+
 /* Sum over the work-items before this one; total: over all. All of the group call it. */
 static uint trb_scan(uint value, __local uint *space, uint *total) {
 #ifdef TRB_CPU

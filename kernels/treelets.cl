@@ -10,7 +10,8 @@ TRB_KERNEL trb_k_find_groups(__global trb_plan *plan, const __global trbvh_node 
 
 TRB_KERNEL trb_k_restructure(const __global trb_plan *plan, __global trbvh_node *nodes, __global uint *lists,
                              const __global trb_group *groups, uint gamma) {
-  if (TRB_GROUP_ID < plan->groups) trb_restructure_group(nodes, lists, groups[TRB_GROUP_ID], gamma, plan->costs);
+  uint i;
+  TRB_FOR_JOBS(i, plan->groups) trb_restructure_group(nodes, lists, groups[i], gamma, plan->costs);
 }
 
 TRB_KERNEL trb_k_restructure_top(const __global trb_plan *plan, __global trbvh_node *nodes, __global uint *lists, uint gamma) {
