@@ -263,7 +263,12 @@ TRBVH_API trbvh_result trbvh_occluded_n (const trbvh *bvh, const trbvh_ray *rays
 #endif
 
 #ifdef TRBVH_OPENCL_C
-  #define TRB_CORE   static inline __attribute__((always_inline, unused))
+  #ifdef TRB_POCL                        /* a CPU, and clang for certain */
+    #define TRB_CORE static inline __attribute__((always_inline, unused))
+    #define TRB_PREFETCH(address) __builtin_prefetch((const void *)(size_t)(address))
+  #else
+    #define TRB_CORE static inline __attribute__((unused))
+  #endif
   #define TRB_SHARED static __attribute__((unused))
   #define TRB_GLOBAL __global
   typedef ulong trb_u64;
@@ -271,9 +276,6 @@ TRBVH_API trbvh_result trbvh_occluded_n (const trbvh *bvh, const trbvh_ray *rays
     #define TRB_WORK __local
   #else
     #define TRB_WORK
-  #endif
-  #ifdef TRB_CAN_PREFETCH                /* a CPU, compiled by clang */
-    #define TRB_PREFETCH(address) __builtin_prefetch((const void *)(size_t)(address))
   #endif
   #define trb_bits(x)  as_uint(x)
   #define trb_float(x) as_float(x)
@@ -1751,6 +1753,7 @@ TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbv
 #define TRB_GPU_CHUNK   1024u            /* leaves over which one group builds the hierarchy ... */
 #define TRB_GPU_CHUNKS  16u              /* ... and so many chunks that the next one joins */
 #define TRB_GPU_LEVELS  128u             /* more than any tree has; they are listed one by one on a GPU */
+#define TRB_ROOTS_MAX   (1u << 20)       /* treelets of one launch: none lasts longer than a watchdog's patience */
 #define TRB_JOB_STEP    64u              /* every so many-th work-group of a CPU gets a heavy job */
 #define TRB_CANDIDATES  16u              /* scales tried at once */
 

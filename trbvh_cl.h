@@ -152,7 +152,12 @@ static const char *const trb_cl_text[] = {
   "#line 255 \"trbvh.h\"\n",
   "  #pragma OPENCL FP_CONTRACT OFF\n",
   "#line 266 \"trbvh.h\"\n",
-  "  #define TRB_CORE   static inline __attribute__((always_inline, unused))\n",
+  "  #ifdef TRB_POCL\n",
+  "    #define TRB_CORE static inline __attribute__((always_inline, unused))\n",
+  "    #define TRB_PREFETCH(address) __builtin_prefetch((const void *)(size_t)(address))\n",
+  "  #else\n",
+  "    #define TRB_CORE static inline __attribute__((unused))\n",
+  "  #endif\n",
   "  #define TRB_SHARED static __attribute__((unused))\n",
   "  #define TRB_GLOBAL __global\n",
   "  typedef ulong trb_u64;\n",
@@ -161,12 +166,9 @@ static const char *const trb_cl_text[] = {
   "  #else\n",
   "    #define TRB_WORK\n",
   "  #endif\n",
-  "  #ifdef TRB_CAN_PREFETCH\n",
-  "    #define TRB_PREFETCH(address) __builtin_prefetch((const void *)(size_t)(address))\n",
-  "  #endif\n",
   "  #define trb_bits(x)  as_uint(x)\n",
   "  #define trb_float(x) as_float(x)\n",
-  "#line 302 \"trbvh.h\"\n",
+  "#line 304 \"trbvh.h\"\n",
   "#ifndef TRB_PREFETCH\n",
   "  #define TRB_PREFETCH(address) ((void)(address))\n",
   "#endif\n",
@@ -177,7 +179,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "    #define TRB_REAL float\n",
   "    #define TRB_NOISE 9.5367432e-7f\n",
-  "#line 316 \"trbvh.h\"\n",
+  "#line 318 \"trbvh.h\"\n",
   "#endif\n",
   "\n",
   "  #define TRB_ALIGNED(type) type __attribute__((aligned(64)))\n",
@@ -189,7 +191,7 @@ static const char *const trb_cl_text[] = {
   "#else\n",
   "  #define TRB_RESTRICT restrict\n",
   "#endif\n",
-  "#line 337 \"trbvh.h\"\n",
+  "#line 339 \"trbvh.h\"\n",
   "#define TRB_MIN(a, b) ((a) < (b) ? (a) : (b))\n",
   "#define TRB_MAX(a, b) ((a) > (b) ? (a) : (b))\n",
   "\n",
@@ -223,7 +225,7 @@ static const char *const trb_cl_text[] = {
   "  for (i = 0; i < 4; i++) r = r * (4.0f - x * r * r * r) * 0.333333343f;\n",
   "  return x * r * r;\n",
   "}\n",
-  "#line 380 \"trbvh.h\"\n",
+  "#line 382 \"trbvh.h\"\n",
   "#define TRB_MAX_LEAF 16u\n",
   "#define TRB_SMALL    0x80000000u\n",
   "#define TRB_LEAF     0x40000000u\n",
@@ -297,7 +299,7 @@ static const char *const trb_cl_text[] = {
   "  trbvh_u32 z = trb_cell(0.5f * box.min[2] + 0.5f * box.max[2], grid.origin[2], grid.cells_per_unit);\n",
   "  return trb_spread(x) << 2 | trb_spread(y) << 1 | trb_spread(z);\n",
   "}\n",
-  "#line 465 \"trbvh.h\"\n",
+  "#line 467 \"trbvh.h\"\n",
   "#define TRB_TREELET 7\n",
   "#define TRB_GPU_LANES 32u\n",
   "#if defined(TRB_CPU)\n",
@@ -425,7 +427,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "TRB_CORE int trb_improves(float cost, float old_cost) { return cost < old_cost - old_cost * 3.8147e-6f; }\n",
-  "#line 597 \"trbvh.h\"\n",
+  "#line 599 \"trbvh.h\"\n",
   "typedef struct trb_plane { int axis, level; float position; } trb_plane;\n",
   "#define TRB_TINY 1e-30f\n",
   "\n",
@@ -512,7 +514,7 @@ static const char *const trb_cl_text[] = {
   "    for (j = 0; j < 3; j++) polygon[i][j] = kept[i][j];\n",
   "  return count;\n",
   "}\n",
-  "#line 688 \"trbvh.h\"\n",
+  "#line 690 \"trbvh.h\"\n",
   "TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {\n",
   "  float polygon[TRB_POLYGON][3], pad[3];\n",
   "  trbvh_node bounds = *box;\n",
@@ -541,7 +543,7 @@ static const char *const trb_cl_text[] = {
   "  *box = bounds;\n",
   "  return 1;\n",
   "}\n",
-  "#line 720 \"trbvh.h\"\n",
+  "#line 722 \"trbvh.h\"\n",
   "  typedef struct trb_mesh {\n",
   "    const __global char *positions, *indices, *boxes;\n",
   "    ulong position_stride, box_stride;\n",
@@ -567,7 +569,7 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE trbvh_u32 trb_index(const trb_mesh *mesh, size_t i) {\n",
   "\n",
   "  return mesh->index_size == 2 ? ((const __global ushort *)mesh->indices)[i] : ((const __global uint *)mesh->indices)[i];\n",
-  "#line 755 \"trbvh.h\"\n",
+  "#line 757 \"trbvh.h\"\n",
   "}\n",
   "\n",
   "TRB_CORE const TRB_GLOBAL char *trb_position(const trb_mesh *mesh, size_t i) {\n",
@@ -662,7 +664,7 @@ static const char *const trb_cl_text[] = {
   "  grid.cells_per_unit = extent > 1e-30f && extent < FLT_MAX ? trb_reciprocal(grid.units_per_cell) : 0;\n",
   "  return grid;\n",
   "}\n",
-  "#line 855 \"trbvh.h\"\n",
+  "#line 857 \"trbvh.h\"\n",
   "#define TRB_SCALE_BITS  36\n",
   "#define TRB_SCALES      2561u\n",
   "#define TRB_SPLIT_STACK 64u\n",
@@ -716,7 +718,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "  return count;\n",
   "}\n",
-  "#line 914 \"trbvh.h\"\n",
+  "#line 916 \"trbvh.h\"\n",
   "#ifndef TRB_PACKED_REFS\n",
   "  #define TRB_PACKED_REFS (1u << 24)\n",
   "#endif\n",
@@ -768,7 +770,7 @@ static const char *const trb_cl_text[] = {
   "      start += n;\n",
   "    }\n",
   "}\n",
-  "#line 972 \"trbvh.h\"\n",
+  "#line 974 \"trbvh.h\"\n",
   "#define TRB_BLOCK    16384u\n",
   "#define TRB_OPEN_MAX 200u\n",
   "#define TRB_NO_SPLIT (~(trb_u64)0)\n",
@@ -874,7 +876,7 @@ static const char *const trb_cl_text[] = {
   "  TRBVH_ASSERT(f.height == 1);\n",
   "  nodes[0] = f.stack[0].node;\n",
   "}\n",
-  "#line 1088 \"trbvh.h\"\n",
+  "#line 1090 \"trbvh.h\"\n",
   "typedef struct trb_treelets {\n",
   "  float     leaves[TRB_TREELET * TRB_LEAF_VALUES * TRB_LANES];\n",
   "  float     table[TRB_SUBSETS * TRB_LANES + 16];\n",
@@ -1081,7 +1083,7 @@ static const char *const trb_cl_text[] = {
   "  trb_restructure_below(nodes, lists, refs, 1, above, costs);\n",
   "}\n",
   "#endif\n",
-  "#line 1305 \"trbvh.h\"\n",
+  "#line 1307 \"trbvh.h\"\n",
   "typedef struct trb_collapser {\n",
   "  TRB_GLOBAL trbvh_node *nodes;\n",
   "  TRB_GLOBAL trbvh_node *spare;\n",
@@ -1341,7 +1343,7 @@ static const char *const trb_cl_text[] = {
   "    trb_make_triangle(mesh, prims[i], &out[i]);\n",
   "  }\n",
   "}\n",
-  "#line 1575 \"trbvh.h\"\n",
+  "#line 1577 \"trbvh.h\"\n",
   "#define TRB_UNIT 5.9604645e-8f\n",
   "#define TRB_ABS(x) ((x) < 0 ? -(x) : (x))\n",
   "typedef struct trb_ray {\n",
@@ -1419,7 +1421,7 @@ static const char *const trb_cl_text[] = {
   "  along = TRB_MIN(along, 1);\n",
   "  return TRB_MAX(along, 0);\n",
   "}\n",
-  "#line 1659 \"trbvh.h\"\n",
+  "#line 1661 \"trbvh.h\"\n",
   "TRB_CORE int trb_hit_triangle(const TRB_GLOBAL trbvh_triangle *t, const trb_ray *r, float tmax, trbvh_hit *hit) {\n",
   "  const int x = r->axis[0], y = r->axis[1], z = r->axis[2];\n",
   "  const trb_corner a = trb_see(t->v0[x], t->v0[y], t->v0[z], r);\n",
@@ -1460,7 +1462,7 @@ static const char *const trb_cl_text[] = {
   "  hit->u = hit->v = 0;\n",
   "  hit->prim = hit->instance = TRBVH_NONE;\n",
   "}\n",
-  "#line 1703 \"trbvh.h\"\n",
+  "#line 1705 \"trbvh.h\"\n",
   "TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbvh_triangle *triangles,\n",
   "                       const trb_ray *r, int any, trbvh_hit *hit) {\n",
   "  trbvh_u32 stack_node[TRBVH_MAX_DEPTH], height = 0, node = 0, i;\n",
@@ -1512,6 +1514,7 @@ static const char *const trb_cl_text[] = {
   "#define TRB_GPU_CHUNK   1024u\n",
   "#define TRB_GPU_CHUNKS  16u\n",
   "#define TRB_GPU_LEVELS  128u\n",
+  "#define TRB_ROOTS_MAX   (1u << 20)\n",
   "#define TRB_JOB_STEP    64u\n",
   "#define TRB_CANDIDATES  16u\n",
   "\n",
@@ -2217,8 +2220,6 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "}\n",
   "\n",
-  "#define TRB_TREELET_KERNEL __kernel __attribute__((reqd_work_group_size(TRB_LANES, 1, 1))) void\n",
-  "\n",
   "static void trb_restructure_lane(__global trbvh_node *nodes, __local trb_treelets *t, uint root, trb_costs costs) {\n",
   "  const uint lane = TRB_LOCAL_ID;\n",
   "  uint i;\n",
@@ -2228,24 +2229,16 @@ static const char *const trb_cl_text[] = {
   "  trb_treelet_costs(t->leaves + lane, t->table + lane, costs);\n",
   "  trb_finish_treelet(nodes, t, lane, root, costs);\n",
   "}\n",
-  "\n",
-  "\n",
-  "TRB_TREELET_KERNEL trb_k_restructure_level(const __global trb_plan *plan, __global trbvh_node *nodes,\n",
-  "                                           const __global trb_level *levels, const __global uint *list, uint level,\n",
-  "                                           uint begin) {\n",
-  "  __local trb_treelets t;\n",
-  "  const uint i = begin + (uint)get_global_id(0);\n",
-  "  if (i < levels[level].count) trb_restructure_lane(nodes, &t, list[levels[level].first + i], plan->costs);\n",
-  "}\n",
-  "\n",
-  "\n",
-  "TRB_TREELET_KERNEL trb_k_restructure_levels(const __global trb_plan *plan, __global trbvh_node *nodes,\n",
-  "                                            const __global trb_level *levels, const __global uint *list, uint level) {\n",
+  "#line 79 \"kernels/treelets.cl\"\n",
+  "__kernel __attribute__((reqd_work_group_size(TRB_LANES, 1, 1)))\n",
+  "void trb_k_restructure_level(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,\n",
+  "                             const __global uint *list, uint level, uint begin, uint rest) {\n",
   "  __local trb_treelets t;\n",
   "  uint lowest = level, i;\n",
-  "  while (lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;\n",
+  "  while (rest && lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;\n",
   "  for (lowest++; lowest-- > level;) {\n",
-  "    for (i = TRB_LOCAL_ID; i < levels[lowest].count; i += TRB_LANES)\n",
+  "    const uint end = rest ? levels[lowest].count : min(levels[lowest].count, begin + TRB_ROOTS_MAX);\n",
+  "    for (i = begin + (uint)get_global_id(0); i < end; i += (uint)get_global_size(0))\n",
   "      trb_restructure_lane(nodes, &t, list[levels[lowest].first + i], plan->costs);\n",
   "    TRB_SYNC();\n",
   "  }\n",
@@ -2626,9 +2619,9 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "#endif\n",
 };
-#define TRB_CL_CORE_LINES 1457u   /* entries of trb_cl_text for user kernels: types, core, traversal */
-#define TRB_CL_LINES      2512u   /* all entries */
-#define TRB_CL_HASH       "999f8f238d8c1f6d"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_CORE_LINES 1460u   /* entries of trb_cl_text for user kernels: types, core, traversal */
+#define TRB_CL_LINES      2505u   /* all entries */
+#define TRB_CL_HASH       "8395abefbb169a06"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
@@ -2852,7 +2845,7 @@ static int trb_cl_load(trb_cl_api *api, trbvh_stats *stats) {
   X(BUILD, build_chunks, "bbbbbbb")   X(BUILD, join_chunks, "bbbbbbbbbu") \
   X(TREELETS, find_groups, "bbbbbu")  X(TREELETS, restructure, "bbbbu")   X(TREELETS, restructure_top, "bbbu") \
   X(TREELETS, first_level, "bbbbu")   X(TREELETS, list_level, "bbbuu")    X(TREELETS, list_levels, "bbbuu") \
-  X(TREELETS, restructure_level, "*bbbbuu")                               X(TREELETS, restructure_levels, "*bbbbu") \
+  X(TREELETS, restructure_level, "*bbbbuuu") \
   X(BUILD, find_tasks, "bbbbbb")      X(BUILD, count_tasks, "bbbbbb")     X(BUILD, sum_tasks, "bb") \
   X(BUILD, emit_top, "bbbbb")         X(BUILD, emit_tasks, "bbbbb") \
   X(BUILD, first_inner, "bbbbb")      X(BUILD, list_inner, "bbbbbbbbu")   X(BUILD, list_rest, "bbbbbbbbu") \
@@ -2906,7 +2899,7 @@ typedef struct trb_cl {
   trb_cl_device_id id;
   trb_cl_context   context;
   trb_cl_queue     queue;
-  int              cpu, prefetches;      /* the shape of its kernels; do they understand __builtin_prefetch */
+  int              cpu, pocl;            /* the shape of its kernels; PoCL's own compiler */
   trb_cl_program   programs[TRB_CL_PROGRAM_COUNT];
   trb_cl_kernel    kernels[TRB_CL_KERNEL_COUNT];
   trb_cl_part      scratch[TRB_CL_SCRATCH_COUNT];    /* kept from build to build */
@@ -3126,7 +3119,7 @@ TRBVH_API trbvh_device *trbvh_cl_open(const trbvh_cl_desc *desc, trbvh_stats *st
     return NULL;
   }
   cl->cpu = TRB_CL_SHAPE ? TRB_CL_SHAPE == 1 : trb_cl_is_cpu(cl);
-  cl->prefetches = cl->cpu && strstr(cl->info.platform, "Portable Computing Language") != NULL;
+  cl->pocl = cl->cpu && strstr(cl->info.platform, "Portable Computing Language") != NULL;
   return &cl->hooks;
 }
 
@@ -3233,7 +3226,7 @@ static trb_cl_program trb_cl_program_of(trb_cl *cl, int index) {
   char options[256], key[128];
   if (cl->programs[index] || cl->error) return cl->programs[index];
   snprintf(options, sizeof options, "-cl-std=CL1.2 -DTRB_WITH_SHAPE %s %s %s", parts[index],
-           cl->cpu ? "-DTRB_CPU" : "-DTRB_GPU", cl->prefetches ? "-DTRB_CAN_PREFETCH" : "");
+           cl->cpu ? "-DTRB_CPU" : "-DTRB_GPU", cl->pocl ? "-DTRB_POCL" : "");
   trb_cl_cache_key(cl, options, key);
   cl->programs[index] = trb_cl_load_program(cl, key, options);
   if (!cl->programs[index]) {
@@ -3603,7 +3596,6 @@ static uint32_t trb_cl_level_groups(uint32_t level, uint32_t n, uint32_t group) 
 }
 
 static void trb_cl_round(trb_cl_work *w, uint32_t gamma) {
-  const uint32_t launch_max = 1u << 20;              /* roots: no launch longer than a watchdog's patience */
   const uint32_t roots = w->b->ref_max / gamma;      /* of one level, at most */
   trb_cl *cl = w->cl;
   uint32_t level, begin;
@@ -3619,11 +3611,11 @@ static void trb_cl_round(trb_cl_work *w, uint32_t gamma) {
     trb_cl_launch(cl, TRB_CL_TREELETS_list_level, groups, w->nodes, w->levels, w->lists, gamma, level);
   }
   trb_cl_launch(cl, TRB_CL_TREELETS_list_levels, 1, w->nodes, w->levels, w->lists, gamma, TRB_CL_WIDE);
-  trb_cl_launch(cl, TRB_CL_TREELETS_restructure_levels, 1, w->state, w->nodes, w->levels, w->lists, TRB_CL_WIDE);
+  trb_cl_launch(cl, TRB_CL_TREELETS_restructure_level, 1, w->state, w->nodes, w->levels, w->lists, TRB_CL_WIDE, 0u, 1u);
   for (level = TRB_CL_WIDE; level-- > 0;)
-    for (begin = 0; begin < roots && (begin == 0 || level >= 20); begin += launch_max) {
-      uint32_t groups = trb_cl_level_groups(level, TRB_MIN(roots - begin, launch_max), TRB_GPU_LANES);
-      trb_cl_launch(cl, TRB_CL_TREELETS_restructure_level, groups, w->state, w->nodes, w->levels, w->lists, level, begin);
+    for (begin = 0; begin < roots && (level >= 31 || begin >> level == 0); begin += TRB_ROOTS_MAX) {
+      uint32_t groups = trb_cl_level_groups(level, TRB_MIN(roots - begin, TRB_ROOTS_MAX), TRB_GPU_LANES);
+      trb_cl_launch(cl, TRB_CL_TREELETS_restructure_level, groups, w->state, w->nodes, w->levels, w->lists, level, begin, 0u);
     }
 }
 
