@@ -3826,11 +3826,12 @@ static trbvh_result trb_cl_trace_batch(trbvh_device *device, trb_build *b, const
   const trbvh *bvh = batch->bvh;
   const size_t out_size = batch->count * (batch->hits ? sizeof(trbvh_hit) : 1);
   void *out = batch->hits ? (void *)batch->hits : (void *)batch->occluded;
-  trbvh_cl_tree tree = {0};
+  trbvh_cl_tree tree;
   trb_cl_mem rays, result;
   if (batch->count < TRB_CL_SMALL && !(b->options.flags & TRBVH_NO_FALLBACK))
     return trb_fail(b, TRBVH_NO_DEVICE, "traced in C: %u rays are too few to be worth a launch", (unsigned)batch->count, 0, 0);
   trb_cl_begin(cl);
+  memset(&tree, 0, sizeof tree);
   tree.node_count = bvh->node_count;
   if (tree.node_count) {
     tree.nodes = trb_cl_input(cl, bvh->nodes, (size_t)bvh->node_count * sizeof(trbvh_node));

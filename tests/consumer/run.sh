@@ -28,7 +28,8 @@ configure_and_build() {
   shift
   cmake -S "$here/$project" -B "$tmp/$project" "$@" &&
   cmake --build "$tmp/$project" &&
-  test "$("$tmp/$project/consumer")" = "$version"
+  test "$("$tmp/$project/consumer")" = "$version" &&
+  test "$("$tmp/$project/consumer_cl")" = "$version"
 }
 cmake_subdir() { configure_and_build cmake_subdir -DTRBVH_FOLDER="$root"; }
 install_and_move() {   # the installed files must not know where they were installed
