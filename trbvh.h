@@ -263,11 +263,13 @@ TRBVH_API trbvh_result trbvh_occluded_n (const trbvh *bvh, const trbvh_ray *rays
 #endif
 
 #ifdef TRBVH_OPENCL_C
-  #ifdef TRB_POCL                        /* a CPU, and clang for certain */
-    #define TRB_CORE static inline __attribute__((always_inline, unused))
-    #define TRB_PREFETCH(address) __builtin_prefetch((const void *)(size_t)(address))
-  #else
+  #ifdef TRB_OUTLINE                     /* for oclgrind, which does not know what inlining leaves behind */
     #define TRB_CORE static inline __attribute__((unused))
+  #else                                  /* rusticl miscompiles the collapse without */
+    #define TRB_CORE static inline __attribute__((always_inline, unused))
+  #endif
+  #ifdef TRB_POCL                        /* a CPU, and clang for certain */
+    #define TRB_PREFETCH(address) __builtin_prefetch((const void *)(size_t)(address))
   #endif
   #define TRB_SHARED static __attribute__((unused))
   #define TRB_GLOBAL __global

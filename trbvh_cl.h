@@ -152,11 +152,13 @@ static const char *const trb_cl_text[] = {
   "#line 255 \"trbvh.h\"\n",
   "  #pragma OPENCL FP_CONTRACT OFF\n",
   "#line 266 \"trbvh.h\"\n",
-  "  #ifdef TRB_POCL\n",
-  "    #define TRB_CORE static inline __attribute__((always_inline, unused))\n",
-  "    #define TRB_PREFETCH(address) __builtin_prefetch((const void *)(size_t)(address))\n",
-  "  #else\n",
+  "  #ifdef TRB_OUTLINE\n",
   "    #define TRB_CORE static inline __attribute__((unused))\n",
+  "  #else\n",
+  "    #define TRB_CORE static inline __attribute__((always_inline, unused))\n",
+  "  #endif\n",
+  "  #ifdef TRB_POCL\n",
+  "    #define TRB_PREFETCH(address) __builtin_prefetch((const void *)(size_t)(address))\n",
   "  #endif\n",
   "  #define TRB_SHARED static __attribute__((unused))\n",
   "  #define TRB_GLOBAL __global\n",
@@ -168,7 +170,7 @@ static const char *const trb_cl_text[] = {
   "  #endif\n",
   "  #define trb_bits(x)  as_uint(x)\n",
   "  #define trb_float(x) as_float(x)\n",
-  "#line 304 \"trbvh.h\"\n",
+  "#line 306 \"trbvh.h\"\n",
   "#ifndef TRB_PREFETCH\n",
   "  #define TRB_PREFETCH(address) ((void)(address))\n",
   "#endif\n",
@@ -179,7 +181,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "    #define TRB_REAL float\n",
   "    #define TRB_NOISE 9.5367432e-7f\n",
-  "#line 318 \"trbvh.h\"\n",
+  "#line 320 \"trbvh.h\"\n",
   "#endif\n",
   "\n",
   "  #define TRB_ALIGNED(type) type __attribute__((aligned(64)))\n",
@@ -191,7 +193,7 @@ static const char *const trb_cl_text[] = {
   "#else\n",
   "  #define TRB_RESTRICT restrict\n",
   "#endif\n",
-  "#line 339 \"trbvh.h\"\n",
+  "#line 341 \"trbvh.h\"\n",
   "#define TRB_MIN(a, b) ((a) < (b) ? (a) : (b))\n",
   "#define TRB_MAX(a, b) ((a) > (b) ? (a) : (b))\n",
   "\n",
@@ -225,7 +227,7 @@ static const char *const trb_cl_text[] = {
   "  for (i = 0; i < 4; i++) r = r * (4.0f - x * r * r * r) * 0.333333343f;\n",
   "  return x * r * r;\n",
   "}\n",
-  "#line 382 \"trbvh.h\"\n",
+  "#line 384 \"trbvh.h\"\n",
   "#define TRB_MAX_LEAF 16u\n",
   "#define TRB_SMALL    0x80000000u\n",
   "#define TRB_LEAF     0x40000000u\n",
@@ -299,7 +301,7 @@ static const char *const trb_cl_text[] = {
   "  trbvh_u32 z = trb_cell(0.5f * box.min[2] + 0.5f * box.max[2], grid.origin[2], grid.cells_per_unit);\n",
   "  return trb_spread(x) << 2 | trb_spread(y) << 1 | trb_spread(z);\n",
   "}\n",
-  "#line 467 \"trbvh.h\"\n",
+  "#line 469 \"trbvh.h\"\n",
   "#define TRB_TREELET 7\n",
   "#define TRB_GPU_LANES 32u\n",
   "#if defined(TRB_CPU)\n",
@@ -427,7 +429,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "TRB_CORE int trb_improves(float cost, float old_cost) { return cost < old_cost - old_cost * 3.8147e-6f; }\n",
-  "#line 599 \"trbvh.h\"\n",
+  "#line 601 \"trbvh.h\"\n",
   "typedef struct trb_plane { int axis, level; float position; } trb_plane;\n",
   "#define TRB_TINY 1e-30f\n",
   "\n",
@@ -514,7 +516,7 @@ static const char *const trb_cl_text[] = {
   "    for (j = 0; j < 3; j++) polygon[i][j] = kept[i][j];\n",
   "  return count;\n",
   "}\n",
-  "#line 690 \"trbvh.h\"\n",
+  "#line 692 \"trbvh.h\"\n",
   "TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {\n",
   "  float polygon[TRB_POLYGON][3], pad[3];\n",
   "  trbvh_node bounds = *box;\n",
@@ -543,7 +545,7 @@ static const char *const trb_cl_text[] = {
   "  *box = bounds;\n",
   "  return 1;\n",
   "}\n",
-  "#line 722 \"trbvh.h\"\n",
+  "#line 724 \"trbvh.h\"\n",
   "  typedef struct trb_mesh {\n",
   "    const __global char *positions, *indices, *boxes;\n",
   "    ulong position_stride, box_stride;\n",
@@ -569,7 +571,7 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE trbvh_u32 trb_index(const trb_mesh *mesh, size_t i) {\n",
   "\n",
   "  return mesh->index_size == 2 ? ((const __global ushort *)mesh->indices)[i] : ((const __global uint *)mesh->indices)[i];\n",
-  "#line 757 \"trbvh.h\"\n",
+  "#line 759 \"trbvh.h\"\n",
   "}\n",
   "\n",
   "TRB_CORE const TRB_GLOBAL char *trb_position(const trb_mesh *mesh, size_t i) {\n",
@@ -664,7 +666,7 @@ static const char *const trb_cl_text[] = {
   "  grid.cells_per_unit = extent > 1e-30f && extent < FLT_MAX ? trb_reciprocal(grid.units_per_cell) : 0;\n",
   "  return grid;\n",
   "}\n",
-  "#line 857 \"trbvh.h\"\n",
+  "#line 859 \"trbvh.h\"\n",
   "#define TRB_SCALE_BITS  36\n",
   "#define TRB_SCALES      2561u\n",
   "#define TRB_SPLIT_STACK 64u\n",
@@ -718,7 +720,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "  return count;\n",
   "}\n",
-  "#line 916 \"trbvh.h\"\n",
+  "#line 918 \"trbvh.h\"\n",
   "#ifndef TRB_PACKED_REFS\n",
   "  #define TRB_PACKED_REFS (1u << 24)\n",
   "#endif\n",
@@ -770,7 +772,7 @@ static const char *const trb_cl_text[] = {
   "      start += n;\n",
   "    }\n",
   "}\n",
-  "#line 974 \"trbvh.h\"\n",
+  "#line 976 \"trbvh.h\"\n",
   "#define TRB_BLOCK    16384u\n",
   "#define TRB_OPEN_MAX 200u\n",
   "#define TRB_NO_SPLIT (~(trb_u64)0)\n",
@@ -876,7 +878,7 @@ static const char *const trb_cl_text[] = {
   "  TRBVH_ASSERT(f.height == 1);\n",
   "  nodes[0] = f.stack[0].node;\n",
   "}\n",
-  "#line 1090 \"trbvh.h\"\n",
+  "#line 1092 \"trbvh.h\"\n",
   "typedef struct trb_treelets {\n",
   "  float     leaves[TRB_TREELET * TRB_LEAF_VALUES * TRB_LANES];\n",
   "  float     table[TRB_SUBSETS * TRB_LANES + 16];\n",
@@ -1083,7 +1085,7 @@ static const char *const trb_cl_text[] = {
   "  trb_restructure_below(nodes, lists, refs, 1, above, costs);\n",
   "}\n",
   "#endif\n",
-  "#line 1307 \"trbvh.h\"\n",
+  "#line 1309 \"trbvh.h\"\n",
   "typedef struct trb_collapser {\n",
   "  TRB_GLOBAL trbvh_node *nodes;\n",
   "  TRB_GLOBAL trbvh_node *spare;\n",
@@ -1343,7 +1345,7 @@ static const char *const trb_cl_text[] = {
   "    trb_make_triangle(mesh, prims[i], &out[i]);\n",
   "  }\n",
   "}\n",
-  "#line 1577 \"trbvh.h\"\n",
+  "#line 1579 \"trbvh.h\"\n",
   "#define TRB_UNIT 5.9604645e-8f\n",
   "#define TRB_ABS(x) ((x) < 0 ? -(x) : (x))\n",
   "typedef struct trb_ray {\n",
@@ -1421,7 +1423,7 @@ static const char *const trb_cl_text[] = {
   "  along = TRB_MIN(along, 1);\n",
   "  return TRB_MAX(along, 0);\n",
   "}\n",
-  "#line 1661 \"trbvh.h\"\n",
+  "#line 1663 \"trbvh.h\"\n",
   "TRB_CORE int trb_hit_triangle(const TRB_GLOBAL trbvh_triangle *t, const trb_ray *r, float tmax, trbvh_hit *hit) {\n",
   "  const int x = r->axis[0], y = r->axis[1], z = r->axis[2];\n",
   "  const trb_corner a = trb_see(t->v0[x], t->v0[y], t->v0[z], r);\n",
@@ -1462,7 +1464,7 @@ static const char *const trb_cl_text[] = {
   "  hit->u = hit->v = 0;\n",
   "  hit->prim = hit->instance = TRBVH_NONE;\n",
   "}\n",
-  "#line 1705 \"trbvh.h\"\n",
+  "#line 1707 \"trbvh.h\"\n",
   "TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbvh_triangle *triangles,\n",
   "                       const trb_ray *r, int any, trbvh_hit *hit) {\n",
   "  trbvh_u32 stack_node[TRBVH_MAX_DEPTH], height = 0, node = 0, i;\n",
@@ -2229,17 +2231,26 @@ static const char *const trb_cl_text[] = {
   "  trb_treelet_costs(t->leaves + lane, t->table + lane, costs);\n",
   "  trb_finish_treelet(nodes, t, lane, root, costs);\n",
   "}\n",
-  "#line 79 \"kernels/treelets.cl\"\n",
-  "__kernel __attribute__((reqd_work_group_size(TRB_LANES, 1, 1)))\n",
-  "void trb_k_restructure_level(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,\n",
-  "                             const __global uint *list, uint level, uint begin, uint rest) {\n",
-  "  __local trb_treelets t;\n",
+  "\n",
+  "#define TRB_TREELET_KERNEL __kernel __attribute__((reqd_work_group_size(TRB_LANES, 1, 1))) void\n",
+  "\n",
+  "\n",
+  "TRB_TREELET_KERNEL trb_k_restructure_level(const __global trb_plan *plan, __global trbvh_node *nodes,\n",
+  "                                           const __global trb_level *levels, const __global uint *list,\n",
+  "                                           __local trb_treelets *t, uint level, uint begin) {\n",
+  "  const uint i = begin + (uint)get_global_id(0);\n",
+  "  if (i < levels[level].count) trb_restructure_lane(nodes, t, list[levels[level].first + i], plan->costs);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_TREELET_KERNEL trb_k_restructure_levels(const __global trb_plan *plan, __global trbvh_node *nodes,\n",
+  "                                            const __global trb_level *levels, const __global uint *list,\n",
+  "                                            __local trb_treelets *t, uint level) {\n",
   "  uint lowest = level, i;\n",
-  "  while (rest && lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;\n",
+  "  while (lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;\n",
   "  for (lowest++; lowest-- > level;) {\n",
-  "    const uint end = rest ? levels[lowest].count : min(levels[lowest].count, begin + TRB_ROOTS_MAX);\n",
-  "    for (i = begin + (uint)get_global_id(0); i < end; i += (uint)get_global_size(0))\n",
-  "      trb_restructure_lane(nodes, &t, list[levels[lowest].first + i], plan->costs);\n",
+  "    for (i = TRB_LOCAL_ID; i < levels[lowest].count; i += TRB_LANES)\n",
+  "      trb_restructure_lane(nodes, t, list[levels[lowest].first + i], plan->costs);\n",
   "    TRB_SYNC();\n",
   "  }\n",
   "}\n",
@@ -2619,9 +2630,9 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "#endif\n",
 };
-#define TRB_CL_CORE_LINES 1460u   /* entries of trb_cl_text for user kernels: types, core, traversal */
-#define TRB_CL_LINES      2505u   /* all entries */
-#define TRB_CL_HASH       "8395abefbb169a06"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_CORE_LINES 1462u   /* entries of trb_cl_text for user kernels: types, core, traversal */
+#define TRB_CL_LINES      2516u   /* all entries */
+#define TRB_CL_HASH       "669825a18fcb32d4"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
@@ -2832,7 +2843,7 @@ static int trb_cl_load(trb_cl_api *api, trbvh_stats *stats) {
   X(REFIT,    "-DTRB_WITH_REFIT -DTRB_WITH_OUTPUT") \
   X(TRACE,    "-DTRB_WITH_TRACE")
 
-/* b: a buffer, u: uint, l: ulong; a star: work-groups of TRB_LANES. */
+/* b: a buffer, u: uint, l: ulong, t: local memory for treelets, not passed; a star: work-groups of TRB_GPU_LANES. */
 #define TRB_CL_KERNELS(X) \
   X(BUILD, read, "bbbbb")             X(BUILD, grid, "bbu")               X(BUILD, count_refs, "bbb") \
   X(BUILD, scan, "bu")                X(BUILD, move_refs, "bbbb")         X(BUILD, return_refs, "bbb") \
@@ -2845,7 +2856,7 @@ static int trb_cl_load(trb_cl_api *api, trbvh_stats *stats) {
   X(BUILD, build_chunks, "bbbbbbb")   X(BUILD, join_chunks, "bbbbbbbbbu") \
   X(TREELETS, find_groups, "bbbbbu")  X(TREELETS, restructure, "bbbbu")   X(TREELETS, restructure_top, "bbbu") \
   X(TREELETS, first_level, "bbbbu")   X(TREELETS, list_level, "bbbuu")    X(TREELETS, list_levels, "bbbuu") \
-  X(TREELETS, restructure_level, "*bbbbuuu") \
+  X(TREELETS, restructure_level, "*bbbbtuu")                              X(TREELETS, restructure_levels, "*bbbbtu") \
   X(BUILD, find_tasks, "bbbbbb")      X(BUILD, count_tasks, "bbbbbb")     X(BUILD, sum_tasks, "bb") \
   X(BUILD, emit_top, "bbbbb")         X(BUILD, emit_tasks, "bbbbb") \
   X(BUILD, first_inner, "bbbbb")      X(BUILD, list_inner, "bbbbbbbbu")   X(BUILD, list_rest, "bbbbbbbbu") \
@@ -3263,7 +3274,10 @@ static void trb_cl_launch(trb_cl *cl, int index, size_t groups, ...) {
   }
   va_start(list, groups);
   for (spec += *spec == '*'; *spec && !error; spec++, i++) {
-    if (*spec == 'b') {
+    if (*spec == 't') {                              /* our own trb_treelets has other lanes */
+      const size_t padding = 16 * sizeof(float), lane = (sizeof(trb_treelets) - padding) / TRB_LANES;
+      error = cl->api.SetKernelArg(cl->kernels[index], i, lane * TRB_GPU_LANES + padding, NULL);
+    } else if (*spec == 'b') {
       trb_cl_mem buffer = va_arg(list, trb_cl_mem);
       error = cl->api.SetKernelArg(cl->kernels[index], i, sizeof buffer, &buffer);
     } else if (*spec == 'u') {
@@ -3611,11 +3625,11 @@ static void trb_cl_round(trb_cl_work *w, uint32_t gamma) {
     trb_cl_launch(cl, TRB_CL_TREELETS_list_level, groups, w->nodes, w->levels, w->lists, gamma, level);
   }
   trb_cl_launch(cl, TRB_CL_TREELETS_list_levels, 1, w->nodes, w->levels, w->lists, gamma, TRB_CL_WIDE);
-  trb_cl_launch(cl, TRB_CL_TREELETS_restructure_level, 1, w->state, w->nodes, w->levels, w->lists, TRB_CL_WIDE, 0u, 1u);
+  trb_cl_launch(cl, TRB_CL_TREELETS_restructure_levels, 1, w->state, w->nodes, w->levels, w->lists, TRB_CL_WIDE);
   for (level = TRB_CL_WIDE; level-- > 0;)
     for (begin = 0; begin < roots && (level >= 31 || begin >> level == 0); begin += TRB_ROOTS_MAX) {
       uint32_t groups = trb_cl_level_groups(level, TRB_MIN(roots - begin, TRB_ROOTS_MAX), TRB_GPU_LANES);
-      trb_cl_launch(cl, TRB_CL_TREELETS_restructure_level, groups, w->state, w->nodes, w->levels, w->lists, level, begin, 0u);
+      trb_cl_launch(cl, TRB_CL_TREELETS_restructure_level, groups, w->state, w->nodes, w->levels, w->lists, level, begin);
     }
 }
 

@@ -73,19 +73,25 @@ static void trb_restructure_lane(__global trbvh_node *nodes, __local trb_treelet
   trb_finish_treelet(nodes, t, lane, root, costs);
 }
 
-/* A launch takes up to TRB_ROOTS_MAX roots of one level, from number `begin` on, or, in one work-group, the rest: all
- * levels from the lowest one up to this. (Two kernels would be clearer, but one of oclgrind's faults is to add up the
- * local memory of all.) */
-__kernel __attribute__((reqd_work_group_size(TRB_LANES, 1, 1)))
-void trb_k_restructure_level(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,
-                             const __global uint *list, uint level, uint begin, uint rest) {
-  __local trb_treelets t;
+#define TRB_TREELET_KERNEL __kernel __attribute__((reqd_work_group_size(TRB_LANES, 1, 1))) void
+
+/* Up to TRB_ROOTS_MAX of the level's roots, from number `begin` on. */
+TRB_TREELET_KERNEL trb_k_restructure_level(const __global trb_plan *plan, __global trbvh_node *nodes,
+                                           const __global trb_level *levels, const __global uint *list,
+                                           __local trb_treelets *t, uint level, uint begin) {
+  const uint i = begin + (uint)get_global_id(0);
+  if (i < levels[level].count) trb_restructure_lane(nodes, t, list[levels[level].first + i], plan->costs);
+}
+
+/* One work-group: all levels from the lowest one up to this. */
+TRB_TREELET_KERNEL trb_k_restructure_levels(const __global trb_plan *plan, __global trbvh_node *nodes,
+                                            const __global trb_level *levels, const __global uint *list,
+                                            __local trb_treelets *t, uint level) {
   uint lowest = level, i;
-  while (rest && lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;
+  while (lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;
   for (lowest++; lowest-- > level;) {
-    const uint end = rest ? levels[lowest].count : min(levels[lowest].count, begin + TRB_ROOTS_MAX);
-    for (i = begin + (uint)get_global_id(0); i < end; i += (uint)get_global_size(0))
-      trb_restructure_lane(nodes, &t, list[levels[lowest].first + i], plan->costs);
+    for (i = TRB_LOCAL_ID; i < levels[lowest].count; i += TRB_LANES)
+      trb_restructure_lane(nodes, t, list[levels[lowest].first + i], plan->costs);
     TRB_SYNC();
   }
 }
