@@ -234,7 +234,7 @@ TRBVH_API trbvh_result trbvh_validate(const trbvh *bvh, const trbvh_geometry *ge
 TRBVH_API int trbvh_intersect(const trbvh *bvh, const trbvh_ray *ray, trbvh_hit *hit);      /* closest hit; 1 = hit */
 TRBVH_API int trbvh_occluded (const trbvh *bvh, const trbvh_ray *ray);                      /* any hit; 1 = occluded */
 /* Many rays at once, on options->device or options->jobs, with progress; options may be NULL. INVALID_ARGUMENT on a
- * tree without triangles that is not empty. options->stats is written on failure only. */
+ * tree without triangles that is not empty. Of options->stats, ms_total, on_device and message are filled. */
 TRBVH_API trbvh_result trbvh_intersect_n(const trbvh *bvh, const trbvh_ray *rays, trbvh_hit *hits, size_t count, const trbvh_options *options);
 TRBVH_API trbvh_result trbvh_occluded_n (const trbvh *bvh, const trbvh_ray *rays, uint8_t *occluded, size_t count, const trbvh_options *options);
 
@@ -1952,7 +1952,7 @@ static void trb_pool_start(trb_pool *pool, uint32_t width) {   /* fewer threads 
   trb_mutex_init(&pool->mutex);
   trb_signal_init(&pool->work);
   trb_signal_init(&pool->idle);
-  while (pool->threads + 1 < TRB_MIN(width, TRB_THREADS_MAX) &&
+  while (pool->threads < TRB_THREADS_MAX - 1 && pool->threads + 1 < width &&
          trb_thread_start(&pool->thread[pool->threads], trb_pool_thread, pool))
     pool->threads++;
 }
@@ -2721,6 +2721,7 @@ static void trb_batch_job(void *context, uint32_t index) {
 static trbvh_result trb_run_batch(trb_batch batch, const trbvh_options *options) {
   trb_build b;
   trbvh_result result;
+  double start = trb_ms();
   memset(&b, 0, sizeof b);
   result = trb_resolve_options(&b, options);
   if (!result && batch.count && (!batch.bvh || !batch.rays || (!batch.hits && !batch.occluded)))
@@ -2733,6 +2734,7 @@ static trbvh_result trb_run_batch(trb_batch batch, const trbvh_options *options)
     trb_runner_start(&b.runner, &b.options, 0);
     result = b.options.device->trace(b.options.device, &b, &batch);
     trb_runner_stop(&b.runner);
+    b.stats.on_device = result == TRBVH_OK;
   }
   if (batch.count && (b.options.device ? trb_falls_back(&b, result) : !result)) {
     uint32_t jobs = (uint32_t)((batch.count + TRB_RAY_BLOCK - 1) / TRB_RAY_BLOCK);
@@ -2743,7 +2745,8 @@ static trbvh_result trb_run_batch(trb_batch batch, const trbvh_options *options)
     trb_runner_stop(&b.runner);
   }
   if (result && !b.stats.message[0]) trb_fail(&b, result, trbvh_result_text(result), 0, 0, 0);
-  if (result && options && options->stats) *options->stats = b.stats;
+  b.stats.ms_total = trb_ms() - start;
+  if (options && options->stats) *options->stats = b.stats;
   return result;
 }
 

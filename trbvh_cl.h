@@ -13,7 +13,8 @@
  *     trbvh_cl_close(options.device);
  *
  *   Everything else stays as it is: bvh is the same tree in host memory, and trbvh_intersect_n and trbvh_occluded_n run
- *   on options.device too. stats.on_device tells which code made the tree, stats.message why it was not the device's.
+ *   on options.device too (where the tree goes with them, every time: for many calls see trbvh_cl_upload and
+ *   trbvh_cl_intersect). stats.on_device tells which code did the work, stats.message why it was not the device's.
  *   For geometry and trees that stay in device memory there are the functions below that begin with trbvh_cl.
  *
  * WHAT IT NEEDS
@@ -65,6 +66,7 @@ TRBVH_API uint32_t      trbvh_cl_devices(trbvh_cl_info *out, uint32_t capacity);
 TRBVH_API trbvh_device *trbvh_cl_open   (const trbvh_cl_desc *desc, trbvh_stats *stats);   /* NULL = none (stats->message says why): passing NULL on builds in scalar C. Both may be NULL */
 TRBVH_API void          trbvh_cl_close  (trbvh_device *device);                            /* waits for it; NULL is fine. Trees of it are freed before */
 TRBVH_API const char   *trbvh_cl_name   (const trbvh_device *device);                      /* never NULL */
+TRBVH_API const char   *trbvh_cl_message(const trbvh_device *device);                      /* why the last trbvh_cl function with this device failed, where it did; never NULL */
 TRBVH_API void          trbvh_cl_trim   (trbvh_device *device);                            /* frees the scratch memory, some 120 to 144 bytes a reference, that a device keeps from build to build; waits */
 
 // >>resident ---- buffers in, tree out, nothing copied to the host ---------------------------------------------------
@@ -82,11 +84,13 @@ typedef struct trbvh_cl_tree {
 } trbvh_cl_tree;
 
 /* All enqueue their work on the device's queue and return; done, where not NULL, gets an event that is complete when the
- * result is there, and is yours to release. On failure tree is {0} and done NULL, and options->stats tells why.
+ * result is there, and is yours to release. On failure done is NULL, the tree of build and upload {0}, and
+ * trbvh_cl_message and options->stats tell why.
  * Options: flags, quality and its settings, progress, stats. Whatever fails, there is no scalar build behind these.
  *
- * build waits once, for some 200 bytes of counts, to make the result's buffers in the right size; tree is {0}, or a
- * tree of the same device, whose buffers are freed.
+ * build waits once, for some 200 bytes of counts, to make the result's buffers in the right size; with options->stats or
+ * options->progress after every stage; and on a CPU where its scratch memory grows. tree is {0}, or a tree of the same
+ * device, whose buffers are freed.
  * refit: the mesh has moved, its topology has not. Boxes of a tree without splits become what build makes them; in one
  * with splits a leaf gets its whole triangles' boxes. The indices are not checked again. */
 TRBVH_API trbvh_result trbvh_cl_build    (trbvh_device *device, trbvh_cl_tree *tree, const trbvh_cl_geometry *geometry, const trbvh_options *options, struct _cl_event **done);
@@ -2653,6 +2657,7 @@ TRBVH_API trbvh_device *trbvh_cl_open(const trbvh_cl_desc *desc, trbvh_stats *st
 }
 TRBVH_API void trbvh_cl_close(trbvh_device *device) { (void)device; }
 TRBVH_API const char *trbvh_cl_name(const trbvh_device *device) { (void)device; return ""; }
+TRBVH_API const char *trbvh_cl_message(const trbvh_device *device) { (void)device; return ""; }
 TRBVH_API void trbvh_cl_trim(trbvh_device *device) { (void)device; }
 TRBVH_API trbvh_result trbvh_cl_build(trbvh_device *device, trbvh_cl_tree *tree, const trbvh_cl_geometry *geometry,
                                       const trbvh_options *options, struct _cl_event **done) {
@@ -2942,6 +2947,12 @@ static trbvh_result trb_cl_result(const trb_cl *cl, trbvh_stats *stats) {
        ? TRBVH_OUT_OF_DEVICE_MEMORY : TRBVH_DEVICE_ERROR;
 }
 
+/* Where it is not the device that is to blame. */
+static trbvh_result trb_cl_refuse(trb_cl *cl, const char *why) {
+  snprintf(cl->message, sizeof cl->message, "%s", why);
+  return TRBVH_INVALID_ARGUMENT;
+}
+
 static trb_u64 trb_cl_hash(trb_u64 hash, const void *bytes, size_t size) {           /* FNV-1a */
   const unsigned char *p = (const unsigned char *)bytes;
   while (size--) hash = (hash ^ *p++) * 0x100000001B3u;
@@ -3035,7 +3046,7 @@ static int trb_cl_contains(const char *text, const char *part) {     /* whatever
   return part[0] == 0;
 }
 
-/* Which of the devices: the first whose name fits, or the first GPU, or the first CPU, or the first. */
+/* Which of the devices: of this name, or the first with it in its name; or the first GPU, or the first CPU, or the first. */
 static const trb_cl_found *trb_cl_choose(const trb_cl_api *api, const trb_cl_found *found, uint32_t count, const char *name) {
   const trb_cl_found *best = NULL;
   uint32_t i;
@@ -3045,7 +3056,7 @@ static const trb_cl_found *trb_cl_choose(const trb_cl_api *api, const trb_cl_fou
     int rank = 1;
     trb_cl_describe(api, found[i].platform, found[i].id, &info);
     if (name && !trb_cl_contains(info.name, name) && !trb_cl_contains(info.platform, name)) continue;
-    if (!name && info.is_gpu) rank = 3;
+    if (name ? !strcmp(name, info.name) : info.is_gpu) rank = 3;
     else if (!name && trb_cl_device_number(api, found[i].id, TRB_CL_DEVICE_TYPE) & TRB_CL_DEVICE_TYPE_CPU) rank = 2;
     if (rank > best_rank) { best = &found[i]; best_rank = rank; }
   }
@@ -3148,6 +3159,10 @@ TRBVH_API void trbvh_cl_close(trbvh_device *device) {
 
 TRBVH_API const char *trbvh_cl_name(const trbvh_device *device) {
   return device ? ((const trb_cl *)device)->info.name : "";
+}
+
+TRBVH_API const char *trbvh_cl_message(const trbvh_device *device) {
+  return device ? ((const trb_cl *)device)->message : "no device";
 }
 
 // >>programs ---- compiled when first needed, from the user's cache or from source -----------------------------------
@@ -3966,6 +3981,7 @@ TRBVH_API trbvh_result trbvh_cl_build(trbvh_device *device, trbvh_cl_tree *tree,
     if (result) trbvh_cl_free(device, tree);
   }
   if (result && !b.stats.message[0]) trb_fail(&b, result, trbvh_result_text(result), 0, 0, 0);
+  if (result && device) trb_cl_refuse(w->cl, b.stats.message);
   b.stats.on_device = result == TRBVH_OK;
   b.stats.ms_total = trb_ms() - start;
   if (options && options->stats) *options->stats = b.stats;
@@ -3984,8 +4000,10 @@ TRBVH_API trbvh_result trbvh_cl_refit(trbvh_device *device, trbvh_cl_tree *tree,
   w->b = &b;
   if (done) *done = NULL;
   result = trb_cl_resolve(w, device, geometry, NULL);
-  if (!result && (!tree || tree->prim_count != b.input.count)) result = TRBVH_INVALID_ARGUMENT;
+  if (result && cl && !cl->error) trb_cl_refuse(cl, b.stats.message);
   if (result) return result;
+  if (!tree || tree->prim_count != b.input.count)
+    return trb_cl_refuse(cl, tree ? "the tree has another number of triangles than the geometry" : "tree is NULL");
   if (tree->node_count) {
     const uint32_t pairs = tree->node_count / 2;
     w->state = trb_cl_scratch(cl, TRB_CL_SCRATCH_state, sizeof(trb_plan));
@@ -4014,7 +4032,8 @@ static trbvh_result trb_cl_query(trbvh_device *device, int kernel, const trbvh_c
   trb_cl *cl = (trb_cl *)device;
   if (done) *done = NULL;
   if (!cl) return TRBVH_NO_DEVICE;
-  if (!tree || (count && (!rays || !out)) || (tree->node_count && !tree->triangles)) return TRBVH_INVALID_ARGUMENT;
+  if (!tree || (count && (!rays || !out))) return trb_cl_refuse(cl, "tree, rays or results are NULL");
+  if (tree->node_count && !tree->triangles) return trb_cl_refuse(cl, "the tree has no triangles");
   trb_cl_begin(cl);
   trb_cl_trace(cl, kernel, tree, rays, out, count);
   trb_cl_mark(cl, done);
@@ -4034,7 +4053,7 @@ TRBVH_API trbvh_result trbvh_cl_occluded(trbvh_device *device, const trbvh_cl_tr
 TRBVH_API trbvh_result trbvh_cl_upload(trbvh_device *device, trbvh_cl_tree *tree, const trbvh *bvh) {
   trb_cl *cl = (trb_cl *)device;
   if (!cl) return TRBVH_NO_DEVICE;
-  if (!tree || !bvh) return TRBVH_INVALID_ARGUMENT;
+  if (!tree || !bvh) return trb_cl_refuse(cl, "tree or bvh is NULL");
   trbvh_cl_free(device, tree);
   trb_cl_begin(cl);
   if (bvh->node_count) {
@@ -4078,6 +4097,7 @@ TRBVH_API trbvh_result trbvh_cl_download(trbvh_device *device, const trbvh_cl_tr
   }
   if (!result) trb_hand_over(&b, bvh, tree->prim_count);
   else if (bvh) trbvh_free(bvh);
+  if (result && cl) trb_cl_refuse(cl, b.stats.message);
   if (options && options->stats) *options->stats = b.stats;
   return result;
 }

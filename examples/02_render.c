@@ -1,11 +1,13 @@
 /* 02_render.c - draws a mesh with every preset, and prints what each costs and what it brings.
- * Introduces: presets, statistics, progress, many rays on several threads, your own walk over the nodes.
+ * Introduces: presets, statistics, progress, many rays on several threads, builds on an OpenCL device, and a
+ * walk of your own over the nodes.
  *
- *   cc -O3 examples/02_render.c -o render -lm -pthread && ./render bunny.ply
+ *   cc -O3 examples/02_render.c -o render -lm -pthread -ldl && ./render bunny.ply
  */
 #define TRBVH_THREADS
 #define TRBVH_IMPLEMENTATION
-#include "../trbvh.h"
+#include "../trbvh_cl.h"               /* trbvh.h alone does without --device */
+#define EX_PROGRAM "02_render"
 #include "common.h"
 
 static const char usage[] =
@@ -14,7 +16,7 @@ static const char usage[] =
   "  --quality NAME  fast, medium, high or best alone, instead of the first three\n"
   "  --splits X      extra references for triangle splitting, as a share of the triangles: 0.3 = 30 %\n"
   "  --threads N     instead of one for each processor\n"
-  "  --device NAME   has no effect yet: this version computes on the processor only\n"
+  "  --device [NAME] build on an OpenCL device: part of its or its platform's name; any, a GPU first\n"
   "  --size WxH      of the picture; 960x640\n"
   "  --out PREFIX    in front of render.png and heatmap.png\n";
 
@@ -25,111 +27,49 @@ typedef struct settings {
   uint32_t threads, width, height;
 } settings;
 
-typedef struct scene_info {
-  ex_mesh mesh;
-  ex_camera camera;
-  ex_vec up, sun;
-  float diagonal, offset;              /* of the bounding box; of ray origins from the surface they leave */
-  float haze;                          /* distance at which most of a surface is lost in it; 0 = none */
-} scene_info;
-
-/* The rays that are timed. What hits is also a check: it must not depend on the tree. */
-enum { PRIMARY, AMBIENT, DIFFUSE, KINDS };
 enum { ROUNDS = 3 };
-static const char *const kind_names[] = {"primary", "ambient occlusion", "diffuse"};
-typedef struct ray_set { trbvh_ray *rays; size_t count; } ray_set;
-
 typedef struct preset {
   const char *name;
   trbvh_quality quality;
   trbvh bvh;
   trbvh_stats stats;
-  double ms[KINDS][ROUNDS];
-  size_t hits[KINDS];
+  double ms_first;                     /* of the first build on a device, which compiles kernels; else 0 */
+  double ms[EX_KINDS][ROUNDS];
+  size_t hits[EX_KINDS];
 } preset;
 
-static void die(const char *format, ...)
-{
-  va_list arguments;
-  va_start(arguments, format);
-  fputs("02_render: ", stderr);
-  vfprintf(stderr, format, arguments);
-  fputs("\n", stderr);
-  va_end(arguments);
-  exit(1);
-}
-static void *allocate(size_t count, size_t size)
-{
-  void *memory = calloc(count ? count : 1, size);
-  if (!memory) die("not enough memory");
-  return memory;
-}
-
 // >>command line --------------------------------------------------------------------------------------------
-static uint32_t parse_count(const char *text, const char *option, uint32_t most, const char **end)
-{
-  char *stop;
-  long count = strtol(text, &stop, 10);
-  if (stop == text || count < 1 || (unsigned long)count > most) {
-    die("%s takes 1..%u, not '%s'", option, most, text);
-  }
-  *end = stop;
-  return (uint32_t)count;
-}
 enum { OPTION_QUALITY, OPTION_SPLITS, OPTION_THREADS, OPTION_DEVICE, OPTION_SIZE, OPTION_OUT, OPTIONS };
-static const char *const option_names[] = {
-  "--quality", "--splits", "--threads", "--device", "--size", "--out"
+static const ex_option options_known[OPTIONS] = {
+  {"--quality", 0}, {"--splits", 0}, {"--threads", 0}, {"--device", 1}, {"--size", 0}, {"--out", 0}
 };
 
-static void set_option(settings *s, int option, const char *value)
+static void set_option(void *user, int option, const char *value)
 {
   static const char *const qualities[] = {"", "fast", "medium", "high", "best"};
-  const char *name = option_names[option], *end = "";
+  settings *s = (settings *)user;
+  const char *name = option < 0 ? "" : options_known[option].name;
   char *number_end;
   switch (option) {
   case OPTION_QUALITY:
     for (int i = 1; i < 5; i++) if (!strcmp(value, qualities[i])) s->quality = (trbvh_quality)i;
-    if (!s->quality) die("%s takes fast, medium, high or best, not '%s'", name, value);
+    if (!s->quality) ex_die("%s takes fast, medium, high or best, not '%s'", name, value);
     break;
   case OPTION_SPLITS:
     s->splits = strtof(value, &number_end);
     if (number_end == value || *number_end || !(s->splits >= 0 && s->splits <= 16)) {
-      die("%s takes 0..16, not '%s'", name, value);
+      ex_die("%s takes 0..16, not '%s'", name, value);
     }
     if (s->splits == 0) s->splits = -1;   /* to the library, 0 is the preset's own value */
     break;
-  case OPTION_THREADS: s->threads = parse_count(value, name, 1024, &end); break;
+  case OPTION_THREADS: s->threads = ex_parse_count(value, name, 1024, NULL); break;
   case OPTION_DEVICE: s->device = value; break;
-  case OPTION_SIZE:
-    s->width = parse_count(value, name, 4096, &end);
-    if (*end != 'x') die("%s takes WxH, like 960x640, not '%s'", name, value);
-    s->height = parse_count(end + 1, name, 4096, &end);
-    break;
-  default: s->prefix = value; break;
+  case OPTION_SIZE: ex_parse_size(value, name, &s->width, &s->height); break;
+  case OPTION_OUT: s->prefix = value; break;
+  default:
+    if (s->mesh) ex_die("one mesh at a time: '%s' or '%s'", s->mesh, value);
+    s->mesh = value;
   }
-  if (*end) die("%s: '%s' is no number", name, value);
-}
-static settings parse_arguments(int argc, char **argv)
-{
-  settings s = {NULL, "", NULL, TRBVH_QUALITY_DEFAULT, 0, ex_processors(), 960, 640};
-  for (int i = 1; i < argc; i++) {
-    int option = 0;
-    if (!strcmp(argv[i], "--help")) {
-      fputs(usage, stdout);
-      exit(0);
-    }
-    if (argv[i][0] != '-') {
-      if (s.mesh) die("one mesh at a time: '%s' or '%s'", s.mesh, argv[i]);
-      s.mesh = argv[i];
-      continue;
-    }
-    while (option < OPTIONS && strcmp(argv[i], option_names[option])) option++;
-    if (option == OPTIONS) die("unknown option '%s'; --help lists them", argv[i]);
-    if (i + 1 == argc) die("%s needs a value", argv[i]);
-    set_option(&s, option, argv[i + 1]);
-    i++;
-  }
-  return s;
 }
 
 // >>progress ------------------------------------------------------------------------------------------------
@@ -155,51 +95,8 @@ static void progress_end(const progress_bar *p)
   if (p->percent >= 0) fprintf(stderr, "\r%*s\r", (int)strlen(p->what) + 8, "");
 }
 
-// >>scene ---------------------------------------------------------------------------------------------------
-static scene_info load_scene(const settings *s)
-{
-  scene_info result;
-  ex_vec low, high;
-  char error[512];
-  float aspect = (float)s->width / (float)s->height;
-  if (s->mesh) {
-    if (!ex_mesh_read(s->mesh, &result.mesh, error, sizeof error)) die("%s", error);
-  } else if (!ex_mesh_demo(&result.mesh, EX_DEMO_DETAIL)) die("not enough memory");
-  if (!ex_mesh_bounds(&result.mesh, &low, &high)) die("%s: no vertex is finite", s->mesh);
-
-  ex_vec size = ex_sub(high, low), center = ex_mix(low, high, 0.5f);
-  result.up = ex_guess_up(low, high);
-  result.diagonal = ex_length(size) > 0 ? ex_length(size) : 1;
-  result.offset = 1e-5f * (result.diagonal + ex_length(center));
-  result.camera = s->mesh ? ex_camera_fit(&result.mesh, result.up, aspect) : ex_demo_camera(aspect);
-  result.haze = s->mesh ? 0 : 600;
-  const ex_camera *c = &result.camera;   /* the sun comes over the viewer's left shoulder */
-  ex_vec left = ex_scale(ex_normalize(c->right), -1), behind = ex_scale(c->forward, -1);
-  result.sun = ex_normalize(ex_mad(ex_mad(result.up, left, 0.9f), behind, 0.35f));
-  return result;
-}
-/* Through pixel number i of a picture, at x, y within it: 0.5, 0.5 is its middle. */
-static trbvh_ray pixel_ray(const scene_info *scene, size_t i, uint32_t width, uint32_t height, float x,
-                           float y)
-{
-  size_t column = i % width, row = i / width;
-  return ex_camera_ray(&scene->camera, ((float)column + x) / (float)width, ((float)row + y) / (float)height);
-}
-/* Where a ray hit, a little off the surface on the side that it came from, and the normal on that side. */
-static ex_vec surface(const scene_info *scene, const trbvh_ray *ray, const trbvh_hit *hit, ex_vec *normal)
-{
-  ex_vec point = ex_mesh_point(&scene->mesh, hit, normal);
-  if (ex_dot(*normal, ex_load(ray->dir)) > 0) *normal = ex_scale(*normal, -1);
-  return ex_mad(point, *normal, scene->offset);
-}
-
 // >>measuring -----------------------------------------------------------------------------------------------
-static void check(trbvh_result result, const char *what, const trbvh_stats *stats)
-{
-  const char *message = stats ? stats->message : "";
-  if (result) die("%s: %s%s%s", what, trbvh_result_text(result), *message ? ": " : "", message);
-}
-/* The fastest of three builds; where one takes long, one is enough. */
+/* The fastest of three builds; where one takes long, one is enough. A device compiles kernels before. */
 static void build(preset *p, const ex_mesh *mesh, const trbvh_options *base)
 {
   trbvh_geometry geometry = ex_mesh_geometry(mesh);
@@ -212,94 +109,77 @@ static void build(preset *p, const ex_mesh *mesh, const trbvh_options *base)
   options.stats = &stats;
   options.progress = progress_show;
   options.progress_user = &bar;
+  if (options.device) {
+    ex_check(trbvh_build(&p->bvh, &geometry, &options), what, &stats);
+    p->ms_first = stats.ms_total;
+  }
   for (int run = 0; run < 3 && (run == 0 || p->stats.ms_total < 1000); run++) {
-    check(trbvh_build(&p->bvh, &geometry, &options), what, &stats);
+    ex_check(trbvh_build(&p->bvh, &geometry, &options), what, &stats);
     if (run == 0 || stats.ms_total < p->stats.ms_total) p->stats = stats;
   }
   progress_end(&bar);
 }
-/* The picture's rays, and from each of their hits one ray as far as ambient occlusion looks and one without a
- * limit. They are the same for all presets. */
-static void make_rays(const scene_info *scene, const settings *s, const trbvh *bvh,
-                      const trbvh_options *options, ray_set sets[KINDS])
+static void measure(preset *presets, int count, const ex_ray_set sets[EX_KINDS], const trbvh_options *options)
 {
-  size_t count = (size_t)s->width * s->height;
-  trbvh_hit *hits = (trbvh_hit *)allocate(count, sizeof *hits);
-  for (int kind = 0; kind < KINDS; kind++) sets[kind].rays = (trbvh_ray *)allocate(count, sizeof(trbvh_ray));
-  sets[PRIMARY].count = count;
-  for (size_t i = 0; i < count; i++) {
-    sets[PRIMARY].rays[i] = pixel_ray(scene, i, s->width, s->height, 0.5f, 0.5f);
-  }
-  check(trbvh_intersect_n(bvh, sets[PRIMARY].rays, hits, count, options), "tracing rays", NULL);
-  sets[AMBIENT].count = sets[DIFFUSE].count = 0;
-  for (size_t i = 0; i < count; i++) {
-    if (hits[i].prim == TRBVH_NONE) continue;
-    uint32_t seed = (uint32_t)i;
-    ex_vec normal, point = surface(scene, &sets[PRIMARY].rays[i], &hits[i], &normal);
-    for (int kind = AMBIENT; kind <= DIFFUSE; kind++) {
-      float a = ex_random(&seed), b = ex_random(&seed);
-      float reach = kind == AMBIENT ? scene->diagonal * 0.1f : 0;
-      sets[kind].rays[sets[kind].count++] = ex_ray(point, ex_cosine_direction(normal, a, b), reach);
-    }
-  }
-  free(hits);
-}
-static void measure(preset *presets, int count, const ray_set sets[KINDS], const trbvh_options *options)
-{
-  size_t most = sets[PRIMARY].count;
-  trbvh_hit *hits = (trbvh_hit *)allocate(most, sizeof *hits);
-  uint8_t *occluded = (uint8_t *)allocate(most, 1);
+  size_t most = sets[EX_PRIMARY].count;
+  trbvh_hit *hits = (trbvh_hit *)ex_allocate(most, sizeof *hits);
+  uint8_t *occluded = (uint8_t *)ex_allocate(most, 1);
   progress_bar bar = progress_start("measuring rays");
-  for (int turn = 0; turn < ROUNDS * KINDS * count; turn++) {
-    int round = turn / (KINDS * count), kind = turn / count % KINDS;
+  for (int turn = 0; turn < ROUNDS * EX_KINDS * count; turn++) {
+    int round = turn / (EX_KINDS * count), kind = turn / count % EX_KINDS;
     preset *p = presets + turn % count;
-    const ray_set *set = sets + kind;
+    const ex_ray_set *set = sets + kind;
     double start = ex_now_ms();
-    trbvh_result result = kind == AMBIENT
+    trbvh_result result = kind == EX_AMBIENT
       ? trbvh_occluded_n(&p->bvh, set->rays, occluded, set->count, options)
       : trbvh_intersect_n(&p->bvh, set->rays, hits, set->count, options);
     p->ms[kind][round] = ex_now_ms() - start;
-    check(result, "tracing rays", NULL);
+    ex_check(result, "tracing rays", NULL);
     p->hits[kind] = 0;
     for (size_t i = 0; i < set->count; i++) {
-      p->hits[kind] += kind == AMBIENT ? occluded[i] : hits[i].prim != TRBVH_NONE;
+      p->hits[kind] += kind == EX_AMBIENT ? occluded[i] : hits[i].prim != TRBVH_NONE;
     }
     if (round == 0 && p->hits[kind] != presets->hits[kind]) {
-      fprintf(stderr, "warning: of the %s rays %zu hit with %s, but %zu with %s\n", kind_names[kind],
+      fprintf(stderr, "warning: of the %s rays %zu hit with %s, but %zu with %s\n", ex_kind_names[kind],
               p->hits[kind], p->name, presets->hits[kind], presets->name);
     }
-    progress_show(&bar, (float)turn / (float)(ROUNDS * KINDS * count));
+    progress_show(&bar, (float)turn / (float)(ROUNDS * EX_KINDS * count));
   }
   progress_end(&bar);
   free(hits);
   free(occluded);
 }
-static double median_of_three(const double x[ROUNDS])
-{
-  return fmax(fmin(x[0], x[1]), fmin(fmax(x[0], x[1]), x[2]));
-}
-static void print_table(const preset *presets, int count, const ray_set sets[KINDS], uint32_t triangles)
+static void print_table(const preset *presets, int count, const ex_ray_set sets[EX_KINDS], uint32_t triangles)
 {
   static const char *const labels[] = {
     "build, ms", "  split", "  morton", "  sort", "  hierarchy", "  treelets", "  collapse", "  finish",
-    "million triangles/s", "SAH cost", "nodes", "leaves", "references", "depth", "million rays/s: primary",
-    "  ambient occlusion", "  diffuse"
+    "  transfer", "first build, ms", "million triangles/s", "SAH cost", "nodes", "leaves", "references",
+    "depth", "million rays/s: primary", "  ambient occlusion", "  diffuse"
   };
-  static const char decimals[] = "11111111220000222";
+  enum { TRANSFER = 8, FIRST };        /* rows that only a device fills */
+  static const char decimals[] = "1111111111220000222";
+  int on_device = 0;
   printf("%-24s", "");
-  for (int i = 0; i < count; i++) printf("%12s", presets[i].name);
+  for (int i = 0; i < count; i++) {
+    printf("%12s", presets[i].name);
+    on_device |= presets[i].stats.on_device;
+  }
   for (size_t row = 0; row < sizeof labels / sizeof *labels; row++) {
+    if ((row == TRANSFER || row == FIRST) && !on_device) continue;
     printf("\n%-24s", labels[row]);
     for (int i = 0; i < count; i++) {
       const trbvh_stats *s = &presets[i].stats;
-      double rate[KINDS];
-      for (int kind = 0; kind < KINDS; kind++) {
-        rate[kind] = (double)sets[kind].count / median_of_three(presets[i].ms[kind]) / 1e3;
+      double rate[EX_KINDS];
+      for (int kind = 0; kind < EX_KINDS; kind++) {
+        double ms[ROUNDS];
+        memcpy(ms, presets[i].ms[kind], sizeof ms);
+        rate[kind] = (double)sets[kind].count / ex_median(ms, ROUNDS) / 1e3;
       }
       const double values[] = {
         s->ms_total, s->ms_split, s->ms_morton, s->ms_sort, s->ms_hierarchy, s->ms_treelets, s->ms_collapse,
-        s->ms_finish, triangles / s->ms_total / 1e3, s->sah_cost, s->node_count, s->leaf_count, s->ref_count,
-        s->max_depth, rate[PRIMARY], rate[AMBIENT], rate[DIFFUSE]
+        s->ms_finish, s->ms_transfer, presets[i].ms_first, triangles / s->ms_total / 1e3, s->sah_cost,
+        s->node_count, s->leaf_count, s->ref_count, s->max_depth, rate[EX_PRIMARY], rate[EX_AMBIENT],
+        rate[EX_DIFFUSE]
       };
       printf("%12.*f", decimals[row] - '0', values[row]);
     }
@@ -307,12 +187,15 @@ static void print_table(const preset *presets, int count, const ray_set sets[KIN
   printf("\n%-24s", "built on");
   for (int i = 0; i < count; i++) printf("%12s", presets[i].stats.on_device ? "device" : "scalar");
   printf("\n");
+  for (int i = 0; i < count; i++) {    /* why it was not the device */
+    if (*presets[i].stats.message) printf("%s: %s\n", presets[i].name, presets[i].stats.message);
+  }
 }
 
 // >>picture -------------------------------------------------------------------------------------------------
 enum { SAMPLES = 4, SKY_RAYS = 4, LIGHT_RAYS = SKY_RAYS + 1 };   /* a pixel (2 x 2); a sample; and the sun */
 
-static ex_vec sky(const scene_info *scene, ex_vec dir)
+static ex_vec sky(const ex_scene *scene, ex_vec dir)
 {
   float height = ex_dot(dir, scene->up);
   ex_vec horizon = ex_v(0.62f, 0.74f, 0.90f), zenith = ex_v(0.10f, 0.27f, 0.66f);
@@ -320,7 +203,7 @@ static ex_vec sky(const scene_info *scene, ex_vec dir)
   return ex_mix(horizon, zenith, sqrtf(height));
 }
 /* What a surface gets from a sky that nothing hides. One value for a normal: open ground is free of noise. */
-static ex_vec skylight(const scene_info *scene, ex_vec normal)
+static ex_vec skylight(const ex_scene *scene, ex_vec normal)
 {
   float upward = 0.5f + 0.5f * ex_dot(normal, scene->up);
   return ex_mix(ex_v(0.20f, 0.18f, 0.16f), ex_v(0.36f, 0.46f, 0.64f), upward);
@@ -341,7 +224,7 @@ typedef struct layer {
   uint32_t *ids;                       /* SAMPLES * pixel + sample: seeds of noise that is always the same */
 } layer;
 typedef struct tracer {
-  const scene_info *scene;
+  const ex_scene *scene;
   const trbvh *bvh;
   const trbvh_options *options;
   layer seen, mirrored;                /* a band of the picture, and what its mirrors show */
@@ -352,11 +235,11 @@ typedef struct tracer {
 static layer allocate_layer(size_t count)
 {
   layer l = {0, NULL, NULL, NULL, NULL, NULL};
-  l.rays = (trbvh_ray *)allocate(count, sizeof *l.rays);
-  l.hits = (trbvh_hit *)allocate(count, sizeof *l.hits);
-  l.normals = (ex_vec *)allocate(count, sizeof *l.normals);
-  l.light = (ex_vec *)allocate(count, sizeof *l.light);
-  l.ids = (uint32_t *)allocate(count, sizeof *l.ids);
+  l.rays = (trbvh_ray *)ex_allocate(count, sizeof *l.rays);
+  l.hits = (trbvh_hit *)ex_allocate(count, sizeof *l.hits);
+  l.normals = (ex_vec *)ex_allocate(count, sizeof *l.normals);
+  l.light = (ex_vec *)ex_allocate(count, sizeof *l.light);
+  l.ids = (uint32_t *)ex_allocate(count, sizeof *l.ids);
   return l;
 }
 static void free_layer(layer *l)
@@ -388,16 +271,16 @@ static void aim_light_rays(const tracer *t, const layer *l, size_t i, ex_vec poi
 }
 static void shade(tracer *t, layer *l)
 {
-  const scene_info *scene = t->scene;
-  check(trbvh_intersect_n(t->bvh, l->rays, l->hits, l->count, t->options), "tracing rays", NULL);
+  const ex_scene *scene = t->scene;
+  ex_check(trbvh_intersect_n(t->bvh, l->rays, l->hits, l->count, t->options), "tracing rays", NULL);
   size_t count = 0;
   for (size_t i = 0; i < l->count; i++) {
     if (l->hits[i].prim == TRBVH_NONE) continue;
-    ex_vec point = surface(scene, &l->rays[i], &l->hits[i], &l->normals[i]);
+    ex_vec point = ex_surface(scene, &l->rays[i], &l->hits[i], &l->normals[i]);
     aim_light_rays(t, l, i, point, t->light_rays + count);
     count += LIGHT_RAYS;
   }
-  check(trbvh_occluded_n(t->bvh, t->light_rays, t->occluded, count, t->options), "tracing rays", NULL);
+  ex_check(trbvh_occluded_n(t->bvh, t->light_rays, t->occluded, count, t->options), "tracing rays", NULL);
   count = 0;
   for (size_t i = 0; i < l->count; i++) {
     ex_vec dir = ex_load(l->rays[i].dir);
@@ -425,7 +308,7 @@ static void reflect(tracer *t)
   for (size_t i = 0; i < seen->count && paint; i++) {
     if (seen->hits[i].prim == TRBVH_NONE || !paint[seen->hits[i].prim].mirror) continue;
     ex_vec dir = ex_load(seen->rays[i].dir), normal;
-    ex_vec point = surface(t->scene, &seen->rays[i], &seen->hits[i], &normal);
+    ex_vec point = ex_surface(t->scene, &seen->rays[i], &seen->hits[i], &normal);
     dir = ex_mad(dir, normal, -2 * ex_dot(dir, normal));
     add_ray(mirrored, ex_ray(point, dir, 0), seen->ids[i]);
   }
@@ -437,21 +320,21 @@ static void reflect(tracer *t)
     seen->light[i] = ex_mix(seen->light[i], mirrored->light[j], share);
   }
 }
-static void render(const scene_info *scene, const settings *s, const trbvh *bvh, const trbvh_options *options,
+static void render(const ex_scene *scene, const settings *s, const trbvh *bvh, const trbvh_options *options,
                    uint8_t *rgb)
 {
   uint32_t rows = 65536 / (SAMPLES * s->width) + 1;
   size_t most = (size_t)SAMPLES * s->width * rows;
   tracer t = {scene, bvh, options, allocate_layer(most), allocate_layer(most), NULL, NULL};
-  t.light_rays = (trbvh_ray *)allocate(most * LIGHT_RAYS, sizeof *t.light_rays);
-  t.occluded = (uint8_t *)allocate(most * LIGHT_RAYS, 1);
+  t.light_rays = (trbvh_ray *)ex_allocate(most * LIGHT_RAYS, sizeof *t.light_rays);
+  t.occluded = (uint8_t *)ex_allocate(most * LIGHT_RAYS, 1);
   progress_bar bar = progress_start("drawing");
   for (uint32_t y = 0; y < s->height; y += rows) {
     uint32_t first = y * s->width, end = (y + rows < s->height ? y + rows : s->height) * s->width;
     t.seen.count = 0;
     for (uint32_t id = first * SAMPLES; id < end * SAMPLES; id++) {
       float x_in = 0.25f + 0.5f * (float)(id & 1), y_in = 0.25f + 0.5f * (float)(id >> 1 & 1);
-      add_ray(&t.seen, pixel_ray(scene, id / SAMPLES, s->width, s->height, x_in, y_in), id);
+      add_ray(&t.seen, ex_pixel_ray(scene, id / SAMPLES, s->width, s->height, x_in, y_in), id);
     }
     shade(&t, &t.seen);
     reflect(&t);
@@ -579,16 +462,16 @@ static void draw_text(picture *image, uint32_t x, uint32_t y, const char *text)
 }
 /* One panel of half the picture's size for each preset, brighter where rays visit more nodes, all to the same
  * scale, with the mean below it. The caller frees its pixels. */
-static picture heat_map(const scene_info *scene, const settings *s, const preset *presets, int count)
+static picture heat_map(const ex_scene *scene, const settings *s, const preset *presets, int count)
 {
   enum { MARGIN = 8, LEGEND = 40 };
   uint32_t width = s->width / 2 + 1, height = s->height / 2 + 1, panels = (uint32_t)count;
   size_t pixels = (size_t)width * height;
-  uint32_t *visits = (uint32_t *)allocate(pixels * panels, sizeof *visits);
+  uint32_t *visits = (uint32_t *)ex_allocate(pixels * panels, sizeof *visits);
   uint32_t histogram[4096] = {0}, scale = 0;
   progress_bar bar = progress_start("counting visits");
   for (size_t i = 0; i < pixels * panels; i++) {
-    trbvh_ray ray = pixel_ray(scene, i % pixels, width, height, 0.5f, 0.5f);
+    trbvh_ray ray = ex_pixel_ray(scene, i % pixels, width, height, 0.5f, 0.5f);
     visits[i] = count_visits(&presets[i / pixels].bvh, &ray);
     histogram[visits[i] < 4095 ? visits[i] : 4095]++;
     if (i % width == 0) progress_show(&bar, (float)i / (float)(pixels * panels));
@@ -599,7 +482,7 @@ static picture heat_map(const scene_info *scene, const settings *s, const preset
   scale = (scale + 9) / 10 * 10;       /* a round number that 99.5 % of the pixels stay below */
 
   picture image = {NULL, panels * (width + MARGIN) - MARGIN, height + LEGEND};
-  image.rgb = (uint8_t *)allocate((size_t)image.width * image.height, 3);
+  image.rgb = (uint8_t *)ex_allocate((size_t)image.width * image.height, 3);
   for (uint32_t panel = 0; panel < panels; panel++) {
     uint32_t left = panel * (width + MARGIN);
     double sum = 0;
@@ -628,14 +511,15 @@ static picture heat_map(const scene_info *scene, const settings *s, const preset
 static void write_picture(const settings *s, const char *name, const picture *image)
 {
   char path[1024];
-  if (snprintf(path, sizeof path, "%s%s", s->prefix, name) >= (int)sizeof path) die("--out is too long");
-  if (!ex_png_write(path, image->rgb, image->width, image->height)) die("%s: cannot be written", path);
+  if (snprintf(path, sizeof path, "%s%s", s->prefix, name) >= (int)sizeof path) ex_die("--out is too long");
+  if (!ex_png_write(path, image->rgb, image->width, image->height)) ex_die("%s: cannot be written", path);
   printf("wrote %s\n", path);
 }
 
 int main(int argc, char **argv)
 {
-  settings s = parse_arguments(argc, argv);
+  settings s = {NULL, "", NULL, TRBVH_QUALITY_DEFAULT, 0, ex_processors(), 960, 640};
+  ex_arguments(argc, argv, usage, options_known, OPTIONS, set_option, &s);
   preset presets[] = {{.name = "fast", .quality = TRBVH_QUALITY_FAST},
                       {.name = "medium", .quality = TRBVH_QUALITY_MEDIUM},
                       {.name = "high", .quality = TRBVH_QUALITY_HIGH},
@@ -645,27 +529,35 @@ int main(int argc, char **argv)
     presets[0] = presets[s.quality - TRBVH_QUALITY_FAST];
     count = 1;
   }
-  if (s.device) fprintf(stderr, "no device '%s' in this version: the processor does everything\n", s.device);
 
-  scene_info scene = load_scene(&s);
-  trbvh_options options = {.split_budget = s.splits};
+  ex_scene scene = ex_scene_load(s.mesh, (float)s.width / (float)s.height);
+  trbvh_options options = {.split_budget = s.splits}, device_options;
   options.jobs.width = s.threads;
   printf("%s: %u triangles; threads: %u\n", s.mesh ? s.mesh : "built-in scene", scene.mesh.triangle_count,
          s.threads);
-  for (int i = 0; i < count; i++) build(&presets[i], &scene.mesh, &options);
+  device_options = options;            /* for builds only: rays and pictures are the C code's */
+  if (s.device) {
+    trbvh_cl_desc desc = {.name = *s.device ? s.device : NULL};
+    trbvh_stats stats;
+    trbvh_device *device = device_options.device = trbvh_cl_open(&desc, &stats);
+    if (device) printf("builds on %s, rays in C on the processor\n", trbvh_cl_name(device));
+    else printf("no device, C does it all: %s\n", stats.message);
+  }
+  for (int i = 0; i < count; i++) build(&presets[i], &scene.mesh, &device_options);
+  trbvh_cl_close(device_options.device);
 
-  ray_set sets[KINDS];
-  make_rays(&scene, &s, &presets[0].bvh, &options, sets);
+  ex_ray_set sets[EX_KINDS];
+  ex_make_rays(&scene, s.width, s.height, &presets[0].bvh, &options, sets);
   measure(presets, count, sets, &options);
   print_table(presets, count, sets, scene.mesh.triangle_count);
 
-  picture drawing = {(uint8_t *)allocate((size_t)s.width * s.height, 3), s.width, s.height};
+  picture drawing = {(uint8_t *)ex_allocate((size_t)s.width * s.height, 3), s.width, s.height};
   render(&scene, &s, &presets[count - 1].bvh, &options, drawing.rgb);
   write_picture(&s, "render.png", &drawing);
   picture map = heat_map(&scene, &s, presets, count);
   write_picture(&s, "heatmap.png", &map);
 
-  for (int kind = 0; kind < KINDS; kind++) free(sets[kind].rays);
+  for (int kind = 0; kind < EX_KINDS; kind++) free(sets[kind].rays);
   for (int i = 0; i < count; i++) trbvh_free(&presets[i].bvh);
   ex_mesh_free(&scene.mesh);
   free(drawing.rgb);

@@ -4,8 +4,9 @@
  *   ex_mesh_read, ex_mesh_parse   OBJ, PLY and STL files, also damaged ones
  *   ex_mesh_demo                  the built-in scene
  *   ex_png_write                  pictures
+ *   ex_arguments, ex_scene_load, ex_make_rays   for programs that measure; where they fail the program ends
  *
- * Functions that can fail return 1 for success and 0 for failure.
+ * All other functions that can fail return 1 for success and 0 for failure.
  */
 #ifndef EX_COMMON_H
 #define EX_COMMON_H
@@ -1337,6 +1338,165 @@ static inline int ex_png_write(const char *path, const uint8_t *rgb, uint32_t wi
   free(rows);
   free(packed);
   return ok;
+}
+
+// >>programs ------------------------------------------------------------------------------------------------
+#ifndef EX_PROGRAM                     /* the name in front of error messages */
+  #define EX_PROGRAM "trbvh"
+#endif
+
+static inline void ex_die(const char *format, ...)
+{
+  va_list arguments;
+  va_start(arguments, format);
+  fputs(EX_PROGRAM ": ", stderr);
+  vfprintf(stderr, format, arguments);
+  fputs("\n", stderr);
+  va_end(arguments);
+  exit(1);
+}
+static inline void *ex_allocate(size_t count, size_t size)
+{
+  void *memory = calloc(count ? count : 1, size);
+  if (!memory) ex_die("not enough memory");
+  return memory;
+}
+static inline void ex_check(trbvh_result result, const char *what, const trbvh_stats *stats)
+{
+  const char *message = stats ? stats->message : "";
+  if (result) ex_die("%s: %s%s%s", what, trbvh_result_text(result), *message ? ": " : "", message);
+}
+
+/* A whole number 1..most; *end is what follows it, and with NULL nothing may follow. */
+static inline uint32_t ex_parse_count(const char *text, const char *option, uint32_t most, const char **end)
+{
+  char *stop;
+  long count = strtol(text, &stop, 10);
+  if (stop == text || (!end && *stop) || count < 1 || (unsigned long)count > most) {
+    ex_die("%s takes 1..%u, not '%s'", option, most, text);
+  }
+  if (end) *end = stop;
+  return (uint32_t)count;
+}
+static inline void ex_parse_size(const char *text, const char *option, uint32_t *width, uint32_t *height)
+{
+  const char *end;
+  *width = ex_parse_count(text, option, 4096, &end);
+  if (*end != 'x') ex_die("%s takes WxH, like 960x640, not '%s'", option, text);
+  *height = ex_parse_count(end + 1, option, 4096, NULL);
+}
+typedef struct ex_option { const char *name; int value_is_optional; } ex_option;   /* value left out: "" */
+/* Calls set(user, option's number or -1 for an argument that is none, value) for each argument. */
+static inline void ex_arguments(int argc, char **argv, const char *usage, const ex_option *options, int count,
+                                void (*set)(void *user, int option, const char *value), void *user)
+{
+  for (int i = 1; i < argc; i++) {
+    int option = 0, has_value = i + 1 < argc;
+    if (!strcmp(argv[i], "--help")) {
+      fputs(usage, stdout);
+      exit(0);
+    }
+    if (argv[i][0] != '-') {
+      set(user, -1, argv[i]);
+      continue;
+    }
+    while (option < count && strcmp(argv[i], options[option].name)) option++;
+    if (option == count) ex_die("unknown option '%s'; --help lists them", argv[i]);
+    if (options[option].value_is_optional) has_value = has_value && argv[i + 1][0] != '-';
+    else if (!has_value) ex_die("%s needs a value", argv[i]);
+    set(user, option, has_value ? argv[i + 1] : "");
+    i += has_value;
+  }
+}
+
+typedef struct ex_scene {
+  ex_mesh mesh;
+  ex_camera camera;
+  ex_vec up, sun;
+  float diagonal, offset;              /* of the bounding box; of ray origins from the surface they leave */
+  float haze;                          /* distance at which most of a surface is lost in it; 0 = none */
+} ex_scene;
+
+/* path: NULL = the built-in scene; aspect: width / height of pictures */
+static inline ex_scene ex_scene_load(const char *path, float aspect)
+{
+  ex_scene scene;
+  ex_vec low, high;
+  char error[512];
+  if (path) {
+    if (!ex_mesh_read(path, &scene.mesh, error, sizeof error)) ex_die("%s", error);
+  } else if (!ex_mesh_demo(&scene.mesh, EX_DEMO_DETAIL)) ex_die("not enough memory");
+  if (!ex_mesh_bounds(&scene.mesh, &low, &high)) ex_die("%s: no vertex is finite", path);
+
+  ex_vec size = ex_sub(high, low), center = ex_mix(low, high, 0.5f);
+  scene.up = ex_guess_up(low, high);
+  scene.diagonal = ex_length(size) > 0 ? ex_length(size) : 1;
+  scene.offset = 1e-5f * (scene.diagonal + ex_length(center));
+  scene.camera = path ? ex_camera_fit(&scene.mesh, scene.up, aspect) : ex_demo_camera(aspect);
+  scene.haze = path ? 0 : 600;
+  const ex_camera *c = &scene.camera;   /* the sun comes over the viewer's left shoulder */
+  ex_vec left = ex_scale(ex_normalize(c->right), -1), behind = ex_scale(c->forward, -1);
+  scene.sun = ex_normalize(ex_mad(ex_mad(scene.up, left, 0.9f), behind, 0.35f));
+  return scene;
+}
+/* Through pixel number i of a picture, at x, y within it: 0.5, 0.5 is its middle. */
+static inline trbvh_ray ex_pixel_ray(const ex_scene *scene, size_t i, uint32_t width, uint32_t height,
+                                     float x, float y)
+{
+  size_t column = i % width, row = i / width;
+  return ex_camera_ray(&scene->camera, ((float)column + x) / (float)width, ((float)row + y) / (float)height);
+}
+/* Where a ray hit, a little off the surface on the side that it came from, and the normal on that side. */
+static inline ex_vec ex_surface(const ex_scene *scene, const trbvh_ray *ray, const trbvh_hit *hit,
+                                ex_vec *normal)
+{
+  ex_vec point = ex_mesh_point(&scene->mesh, hit, normal);
+  if (ex_dot(*normal, ex_load(ray->dir)) > 0) *normal = ex_scale(*normal, -1);
+  return ex_mad(point, *normal, scene->offset);
+}
+
+/* Rays to be timed. */
+enum { EX_PRIMARY, EX_AMBIENT, EX_DIFFUSE, EX_KINDS };
+static const char *const ex_kind_names[] = {"primary", "ambient occlusion", "diffuse"};
+typedef struct ex_ray_set { trbvh_ray *rays; size_t count; } ex_ray_set;
+
+/* A picture's rays, and from each of their hits one ray as far as ambient occlusion looks and one without a
+ * limit. They are the same for all trees of a scene. The caller frees the three sets' rays. */
+static inline void ex_make_rays(const ex_scene *scene, uint32_t width, uint32_t height, const trbvh *bvh,
+                                const trbvh_options *options, ex_ray_set sets[EX_KINDS])
+{
+  size_t count = (size_t)width * height;
+  trbvh_hit *hits = (trbvh_hit *)ex_allocate(count, sizeof *hits);
+  for (int kind = 0; kind < EX_KINDS; kind++) {
+    sets[kind].rays = (trbvh_ray *)ex_allocate(count, sizeof(trbvh_ray));
+    sets[kind].count = 0;
+  }
+  sets[EX_PRIMARY].count = count;
+  for (size_t i = 0; i < count; i++) {
+    sets[EX_PRIMARY].rays[i] = ex_pixel_ray(scene, i, width, height, 0.5f, 0.5f);
+  }
+  ex_check(trbvh_intersect_n(bvh, sets[EX_PRIMARY].rays, hits, count, options), "tracing rays", NULL);
+  for (size_t i = 0; i < count; i++) {
+    if (hits[i].prim == TRBVH_NONE) continue;
+    uint32_t seed = (uint32_t)i;
+    ex_vec normal, point = ex_surface(scene, &sets[EX_PRIMARY].rays[i], &hits[i], &normal);
+    for (int kind = EX_AMBIENT; kind <= EX_DIFFUSE; kind++) {
+      float a = ex_random(&seed), b = ex_random(&seed);
+      float reach = kind == EX_AMBIENT ? scene->diagonal * 0.1f : 0;
+      sets[kind].rays[sets[kind].count++] = ex_ray(point, ex_cosine_direction(normal, a, b), reach);
+    }
+  }
+  free(hits);
+}
+static inline double ex_median(double *x, int count)   /* sorts x; of an even count, the lower one */
+{
+  for (int i = 1; i < count; i++) {
+    double value = x[i];
+    int k = i;
+    for (; k > 0 && x[k - 1] > value; k--) x[k] = x[k - 1];
+    x[k] = value;
+  }
+  return x[(count - 1) / 2];
 }
 
 #endif /* EX_COMMON_H */

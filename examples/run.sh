@@ -1,7 +1,8 @@
 #!/bin/sh
 # Builds 02_render.c and draws a mesh, or the built-in scene:
 #   sh examples/run.sh [mesh.obj|.ply|.stl] [options: --help lists them]
-# CC chooses the compiler, TRBVH_OUT the folder for the program and the pictures (build/ in the project).
+# Then 03_opencl.c, with the same mesh, and 04_own_kernel.c, which say so where there is no OpenCL.
+# CC chooses the compiler, TRBVH_OUT the folder for the programs and the pictures (build/ in the project).
 set -eu
 root=$(cd "$(dirname "$0")/.." && pwd)
 out=${TRBVH_OUT:-build}
@@ -29,5 +30,16 @@ if ! find_compiler; then
 fi
 
 mkdir -p "$out"
-$compiler -O3 "$root/examples/02_render.c" -o "$out/02_render" -lm -pthread
-exec "$out/02_render" --out "$out/" "$@"
+libraries="-lm -pthread"
+if [ "$(uname)" = Linux ]; then libraries="$libraries -ldl"; fi   # its own library before glibc 2.34
+for name in 02_render 03_opencl 04_own_kernel; do
+  $compiler -O3 "$root/examples/$name.c" -o "$out/$name" $libraries
+done
+case " $* " in *" --help "*) exec "$out/02_render" --help ;; esac
+mesh=
+case ${1:-} in -*) ;; *) mesh=${1:-} ;; esac
+"$out/02_render" --out "$out/" "$@"
+echo
+"$out/03_opencl" ${mesh:+"$mesh"}
+echo
+"$out/04_own_kernel" "$out/own_kernel.png"
