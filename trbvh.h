@@ -50,6 +50,9 @@
  * WHAT IT DOES NOT
  *   exit, abort, print, read files or the environment, keep globals, or start threads unasked.
  *
+ * OPENCL
+ *   trbvh_cl.h builds and traces on a GPU, or on any other OpenCL device: the same tree.
+ *
  * THREADS
  *   Set options.jobs to your engine's job system, or define TRBVH_THREADS before the implementation and set
  *   options.jobs.width: threads of the library's own then live as long as the call. Queries are const and may run

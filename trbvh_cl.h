@@ -117,7 +117,7 @@ TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines);
 
 // >>kernels begin ---- made by kernels/embed.c from trbvh.h and kernels/*.cl: do not edit ---------------------------
 static const char *const trb_cl_text[] = {
-  "#line 73 \"trbvh.h\"\n",
+  "#line 76 \"trbvh.h\"\n",
   "#define TRBVH_VERSION_MAJOR 0\n",
   "#define TRBVH_VERSION_MINOR 1\n",
   "#define TRBVH_VERSION_PATCH 0\n",
@@ -127,7 +127,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "  #define TRBVH_OPENCL_C 1\n",
   "  typedef uint trbvh_u32;\n",
-  "#line 87 \"trbvh.h\"\n",
+  "#line 90 \"trbvh.h\"\n",
   "#define TRBVH_NONE      0xFFFFFFFFu\n",
   "#define TRBVH_MAX_DEPTH 64\n",
   "\n",
@@ -153,9 +153,9 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "typedef struct trbvh_hit { float t, u, v; trbvh_u32 prim; trbvh_u32 instance; } trbvh_hit;\n",
-  "#line 255 \"trbvh.h\"\n",
+  "#line 258 \"trbvh.h\"\n",
   "  #pragma OPENCL FP_CONTRACT OFF\n",
-  "#line 266 \"trbvh.h\"\n",
+  "#line 269 \"trbvh.h\"\n",
   "  #ifdef TRB_OUTLINE\n",
   "    #define TRB_CORE static inline __attribute__((unused))\n",
   "  #else\n",
@@ -174,7 +174,7 @@ static const char *const trb_cl_text[] = {
   "  #endif\n",
   "  #define trb_bits(x)  as_uint(x)\n",
   "  #define trb_float(x) as_float(x)\n",
-  "#line 306 \"trbvh.h\"\n",
+  "#line 309 \"trbvh.h\"\n",
   "#ifndef TRB_PREFETCH\n",
   "  #define TRB_PREFETCH(address) ((void)(address))\n",
   "#endif\n",
@@ -185,7 +185,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "    #define TRB_REAL float\n",
   "    #define TRB_NOISE 9.5367432e-7f\n",
-  "#line 320 \"trbvh.h\"\n",
+  "#line 323 \"trbvh.h\"\n",
   "#endif\n",
   "\n",
   "  #define TRB_ALIGNED(type) type __attribute__((aligned(64)))\n",
@@ -197,7 +197,7 @@ static const char *const trb_cl_text[] = {
   "#else\n",
   "  #define TRB_RESTRICT restrict\n",
   "#endif\n",
-  "#line 341 \"trbvh.h\"\n",
+  "#line 344 \"trbvh.h\"\n",
   "#define TRB_MIN(a, b) ((a) < (b) ? (a) : (b))\n",
   "#define TRB_MAX(a, b) ((a) > (b) ? (a) : (b))\n",
   "\n",
@@ -231,7 +231,7 @@ static const char *const trb_cl_text[] = {
   "  for (i = 0; i < 4; i++) r = r * (4.0f - x * r * r * r) * 0.333333343f;\n",
   "  return x * r * r;\n",
   "}\n",
-  "#line 384 \"trbvh.h\"\n",
+  "#line 387 \"trbvh.h\"\n",
   "#define TRB_MAX_LEAF 16u\n",
   "#define TRB_SMALL    0x80000000u\n",
   "#define TRB_LEAF     0x40000000u\n",
@@ -305,7 +305,7 @@ static const char *const trb_cl_text[] = {
   "  trbvh_u32 z = trb_cell(0.5f * box.min[2] + 0.5f * box.max[2], grid.origin[2], grid.cells_per_unit);\n",
   "  return trb_spread(x) << 2 | trb_spread(y) << 1 | trb_spread(z);\n",
   "}\n",
-  "#line 469 \"trbvh.h\"\n",
+  "#line 472 \"trbvh.h\"\n",
   "#define TRB_TREELET 7\n",
   "#define TRB_GPU_LANES 32u\n",
   "#if defined(TRB_CPU)\n",
@@ -433,7 +433,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "TRB_CORE int trb_improves(float cost, float old_cost) { return cost < old_cost - old_cost * 3.8147e-6f; }\n",
-  "#line 601 \"trbvh.h\"\n",
+  "#line 604 \"trbvh.h\"\n",
   "typedef struct trb_plane { int axis, level; float position; } trb_plane;\n",
   "#define TRB_TINY 1e-30f\n",
   "\n",
@@ -520,7 +520,7 @@ static const char *const trb_cl_text[] = {
   "    for (j = 0; j < 3; j++) polygon[i][j] = kept[i][j];\n",
   "  return count;\n",
   "}\n",
-  "#line 692 \"trbvh.h\"\n",
+  "#line 695 \"trbvh.h\"\n",
   "TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {\n",
   "  float polygon[TRB_POLYGON][3], pad[3];\n",
   "  trbvh_node bounds = *box;\n",
@@ -549,7 +549,7 @@ static const char *const trb_cl_text[] = {
   "  *box = bounds;\n",
   "  return 1;\n",
   "}\n",
-  "#line 724 \"trbvh.h\"\n",
+  "#line 727 \"trbvh.h\"\n",
   "  typedef struct trb_mesh {\n",
   "    const __global char *positions, *indices, *boxes;\n",
   "    ulong position_stride, box_stride;\n",
@@ -575,7 +575,7 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE trbvh_u32 trb_index(const trb_mesh *mesh, size_t i) {\n",
   "\n",
   "  return mesh->index_size == 2 ? ((const __global ushort *)mesh->indices)[i] : ((const __global uint *)mesh->indices)[i];\n",
-  "#line 759 \"trbvh.h\"\n",
+  "#line 762 \"trbvh.h\"\n",
   "}\n",
   "\n",
   "TRB_CORE const TRB_GLOBAL char *trb_position(const trb_mesh *mesh, size_t i) {\n",
@@ -670,7 +670,7 @@ static const char *const trb_cl_text[] = {
   "  grid.cells_per_unit = extent > 1e-30f && extent < FLT_MAX ? trb_reciprocal(grid.units_per_cell) : 0;\n",
   "  return grid;\n",
   "}\n",
-  "#line 859 \"trbvh.h\"\n",
+  "#line 862 \"trbvh.h\"\n",
   "#define TRB_SCALE_BITS  36\n",
   "#define TRB_SCALES      2561u\n",
   "#define TRB_SPLIT_STACK 64u\n",
@@ -724,7 +724,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "  return count;\n",
   "}\n",
-  "#line 918 \"trbvh.h\"\n",
+  "#line 921 \"trbvh.h\"\n",
   "#ifndef TRB_PACKED_REFS\n",
   "  #define TRB_PACKED_REFS (1u << 24)\n",
   "#endif\n",
@@ -776,7 +776,7 @@ static const char *const trb_cl_text[] = {
   "      start += n;\n",
   "    }\n",
   "}\n",
-  "#line 976 \"trbvh.h\"\n",
+  "#line 979 \"trbvh.h\"\n",
   "#define TRB_BLOCK    16384u\n",
   "#define TRB_OPEN_MAX 200u\n",
   "#define TRB_NO_SPLIT (~(trb_u64)0)\n",
@@ -882,7 +882,7 @@ static const char *const trb_cl_text[] = {
   "  TRBVH_ASSERT(f.height == 1);\n",
   "  nodes[0] = f.stack[0].node;\n",
   "}\n",
-  "#line 1092 \"trbvh.h\"\n",
+  "#line 1095 \"trbvh.h\"\n",
   "typedef struct trb_treelets {\n",
   "  float     leaves[TRB_TREELET * TRB_LEAF_VALUES * TRB_LANES];\n",
   "  float     table[TRB_SUBSETS * TRB_LANES + 16];\n",
@@ -1089,7 +1089,7 @@ static const char *const trb_cl_text[] = {
   "  trb_restructure_below(nodes, lists, refs, 1, above, costs);\n",
   "}\n",
   "#endif\n",
-  "#line 1309 \"trbvh.h\"\n",
+  "#line 1312 \"trbvh.h\"\n",
   "typedef struct trb_collapser {\n",
   "  TRB_GLOBAL trbvh_node *nodes;\n",
   "  TRB_GLOBAL trbvh_node *spare;\n",
@@ -1349,7 +1349,7 @@ static const char *const trb_cl_text[] = {
   "    trb_make_triangle(mesh, prims[i], &out[i]);\n",
   "  }\n",
   "}\n",
-  "#line 1579 \"trbvh.h\"\n",
+  "#line 1582 \"trbvh.h\"\n",
   "#define TRB_UNIT 5.9604645e-8f\n",
   "#define TRB_ABS(x) ((x) < 0 ? -(x) : (x))\n",
   "typedef struct trb_ray {\n",
@@ -1427,7 +1427,7 @@ static const char *const trb_cl_text[] = {
   "  along = TRB_MIN(along, 1);\n",
   "  return TRB_MAX(along, 0);\n",
   "}\n",
-  "#line 1663 \"trbvh.h\"\n",
+  "#line 1666 \"trbvh.h\"\n",
   "TRB_CORE int trb_hit_triangle(const TRB_GLOBAL trbvh_triangle *t, const trb_ray *r, float tmax, trbvh_hit *hit) {\n",
   "  const int x = r->axis[0], y = r->axis[1], z = r->axis[2];\n",
   "  const trb_corner a = trb_see(t->v0[x], t->v0[y], t->v0[z], r);\n",
@@ -1468,7 +1468,7 @@ static const char *const trb_cl_text[] = {
   "  hit->u = hit->v = 0;\n",
   "  hit->prim = hit->instance = TRBVH_NONE;\n",
   "}\n",
-  "#line 1707 \"trbvh.h\"\n",
+  "#line 1710 \"trbvh.h\"\n",
   "TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbvh_triangle *triangles,\n",
   "                       const trb_ray *r, int any, trbvh_hit *hit) {\n",
   "  trbvh_u32 stack_node[TRBVH_MAX_DEPTH], height = 0, node = 0, i;\n",
@@ -2636,7 +2636,7 @@ static const char *const trb_cl_text[] = {
 };
 #define TRB_CL_CORE_LINES 1462u   /* entries of trb_cl_text for user kernels: types, core, traversal */
 #define TRB_CL_LINES      2516u   /* all entries */
-#define TRB_CL_HASH       "669825a18fcb32d4"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_HASH       "38c6e95203d39b79"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
@@ -2713,7 +2713,7 @@ typedef struct _cl_kernel        *trb_cl_kernel;
 typedef struct _cl_event         *trb_cl_event;
 
 enum {                                   /* names and values of CL/cl.h */
-  TRB_CL_SUCCESS = 0, TRB_CL_DEVICE_NOT_FOUND = -1, TRB_CL_MEM_OBJECT_ALLOCATION_FAILURE = -4,
+  TRB_CL_MEM_OBJECT_ALLOCATION_FAILURE = -4, TRB_CL_OUT_OF_HOST_MEMORY = -6, TRB_CL_BUILD_PROGRAM_FAILURE = -11,
   TRB_CL_INVALID_BUFFER_SIZE = -61,
   TRB_CL_DEVICE_TYPE_CPU = 2, TRB_CL_DEVICE_TYPE_GPU = 4,
   TRB_CL_PLATFORM_NAME = 0x0902,
@@ -2917,6 +2917,7 @@ typedef struct trb_cl {
   trb_cl_queue     queue;
   int              cpu, pocl;            /* the shape of its kernels; PoCL's own compiler */
   trb_cl_program   programs[TRB_CL_PROGRAM_COUNT];
+  char             broken[TRB_CL_PROGRAM_COUNT][256];        /* why a program does not compile: it is not tried again */
   trb_cl_kernel    kernels[TRB_CL_KERNEL_COUNT];
   trb_cl_part      scratch[TRB_CL_SCRATCH_COUNT];    /* kept from build to build */
   /* the first call that failed since the last trb_cl_begin; nothing is enqueued after it */
@@ -2935,6 +2936,11 @@ static int trb_cl_check(trb_cl *cl, int32_t error, const char *call) {
     snprintf(cl->message, sizeof cl->message, "%s failed on %.80s: error %d", call, cl->info.name, (int)error);
   }
   return cl->error == 0;
+}
+
+/* The same for a call that makes an object. */
+static int trb_cl_made(trb_cl *cl, const void *object, int32_t error, const char *call) {
+  return trb_cl_check(cl, object || error ? error : TRB_CL_OUT_OF_HOST_MEMORY, call);
 }
 
 static void trb_cl_begin(trb_cl *cl) { cl->error = 0; cl->message[0] = 0; }
@@ -3104,12 +3110,12 @@ static int trb_cl_open_queue(trb_cl *cl, trbvh_stats *stats) {
   cl->id = chosen->id;
   trb_cl_describe(&cl->api, chosen->platform, cl->id, &cl->info);
   cl->context = cl->api.CreateContext(NULL, 1, &cl->id, NULL, NULL, &error);
-  if (!trb_cl_check(cl, cl->context ? error : error ? error : -6, "clCreateContext")) return 0;
+  if (!trb_cl_made(cl, cl->context, error, "clCreateContext")) return 0;
 #ifdef TRB_CL_PROFILE
   properties = TRB_CL_QUEUE_PROFILING;
 #endif
   cl->queue = cl->api.CreateCommandQueue(cl->context, cl->id, properties, &error);
-  return trb_cl_check(cl, cl->queue ? error : error ? error : -6, "clCreateCommandQueue");
+  return trb_cl_made(cl, cl->queue, error, "clCreateCommandQueue");
 }
 
 static trbvh_result trb_cl_build_tree(trbvh_device *device, trb_build *b, trbvh *bvh);
@@ -3216,11 +3222,11 @@ static void trb_cl_save_program(trb_cl *cl, trb_cl_program program, const char *
   TRBVH_FREE(bytes);
 }
 
-static trb_cl_program trb_cl_compile_program(trb_cl *cl, const char *options) {
+static trb_cl_program trb_cl_compile_program(trb_cl *cl, const char *options, char broken[256]) {
   int32_t error = 0;
   const char **text = (const char **)(uintptr_t)trb_cl_text;         /* OpenCL's declaration lacks a const */
   trb_cl_program program = cl->api.CreateProgramWithSource(cl->context, TRB_CL_LINES, text, NULL, &error);
-  if (!trb_cl_check(cl, program ? error : error ? error : -6, "clCreateProgramWithSource")) return NULL;
+  if (!trb_cl_made(cl, program, error, "clCreateProgramWithSource")) return NULL;
   error = cl->api.BuildProgram(program, 1, &cl->id, options, NULL, NULL);
   if (error) {
     char log[160] = "";
@@ -3234,9 +3240,9 @@ static trb_cl_program trb_cl_compile_program(trb_cl *cl, const char *options) {
       }
       TRBVH_FREE(whole);
     }
-    if (!cl->error)
-      snprintf(cl->message, sizeof cl->message, "clBuildProgram failed: error %d: %s", (int)error, log);
     cl->error = error;
+    snprintf(cl->message, sizeof cl->message, "clBuildProgram failed: error %d: %s", (int)error, log);
+    if (error == TRB_CL_BUILD_PROGRAM_FAILURE) memcpy(broken, cl->message, sizeof cl->message);
     cl->api.ReleaseProgram(program);
     return NULL;
   }
@@ -3251,12 +3257,17 @@ static trb_cl_program trb_cl_program_of(trb_cl *cl, int index) {
   };
   char options[256], key[128];
   if (cl->programs[index] || cl->error) return cl->programs[index];
+  if (cl->broken[index][0]) {
+    cl->error = TRB_CL_BUILD_PROGRAM_FAILURE;
+    memcpy(cl->message, cl->broken[index], sizeof cl->message);
+    return NULL;
+  }
   snprintf(options, sizeof options, "-cl-std=CL1.2 -DTRB_WITH_SHAPE %s %s %s", parts[index],
            cl->cpu ? "-DTRB_CPU" : "-DTRB_GPU", cl->pocl ? "-DTRB_POCL" : "");
   trb_cl_cache_key(cl, options, key);
   cl->programs[index] = trb_cl_load_program(cl, key, options);
   if (!cl->programs[index]) {
-    cl->programs[index] = trb_cl_compile_program(cl, options);
+    cl->programs[index] = trb_cl_compile_program(cl, options, cl->broken[index]);
     if (cl->programs[index]) trb_cl_save_program(cl, cl->programs[index], key);
   }
   return cl->programs[index];
@@ -3284,8 +3295,7 @@ static void trb_cl_launch(trb_cl *cl, int index, size_t groups, ...) {
     trb_cl_program program = trb_cl_program_of(cl, table[index].program);
     if (!program) return;
     cl->kernels[index] = cl->api.CreateKernel(program, table[index].name, &error);
-    if (!cl->kernels[index] && !error) error = -6;
-    if (!trb_cl_check(cl, error, "clCreateKernel")) return;
+    if (!trb_cl_made(cl, cl->kernels[index], error, "clCreateKernel")) return;
   }
   va_start(list, groups);
   for (spec += *spec == '*'; *spec && !error; spec++, i++) {
@@ -3412,8 +3422,7 @@ static void trb_cl_fetch(trb_cl *cl, trb_cl_mem buffer, void *host, size_t size)
   if (!cl->cpu || size < 64) { trb_cl_read(cl, buffer, host, size); return; }
   if (cl->error) return;
   mapped = cl->api.EnqueueMapBuffer(cl->queue, buffer, 1, TRB_CL_MAP_READ, 0, size, 0, NULL, NULL, &error);
-  if (!mapped && !error) error = -6;
-  if (trb_cl_check(cl, error, "clEnqueueMapBuffer"))
+  if (trb_cl_made(cl, mapped, error, "clEnqueueMapBuffer"))
     trb_cl_check(cl, cl->api.EnqueueUnmapMemObject(cl->queue, buffer, mapped, 0, NULL, NULL), "clEnqueueUnmapMemObject");
   trb_cl_finish(cl);
 }
