@@ -1694,6 +1694,14 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "\n",
   "\n",
+  "static trb_partial trb_merge_all(const __global trb_partial *partials, uint count, __local trb_partial *space) {\n",
+  "  trb_partial sum = trb_nothing();\n",
+  "  uint i;\n",
+  "  for (i = TRB_LOCAL_ID; i < count; i += TRB_GROUP) trb_merge(&sum, partials[i]);\n",
+  "  return trb_merge_group(sum, space);\n",
+  "}\n",
+  "\n",
+  "\n",
   "TRB_KERNEL trb_k_read(__global trb_plan *plan, const __global char *positions, const __global char *indices,\n",
   "                      __global trbvh_node *refs, __global trb_partial *partials) {\n",
   "  __local trb_partial space[TRB_GROUP];\n",
@@ -1723,10 +1731,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "TRB_KERNEL trb_k_grid(__global trb_plan *plan, const __global trb_partial *partials, uint count) {\n",
   "  __local trb_partial space[TRB_GROUP];\n",
-  "  trb_partial sum = trb_nothing();\n",
-  "  uint i;\n",
-  "  for (i = TRB_LOCAL_ID; i < count; i += TRB_GROUP) trb_merge(&sum, partials[i]);\n",
-  "  sum = trb_merge_group(sum, space);\n",
+  "  const trb_partial sum = trb_merge_all(partials, count, space);\n",
   "  if (TRB_LOCAL_ID != 0) return;\n",
   "  plan->grid = trb_make_grid(sum.bounds);\n",
   "  plan->skipped = sum.skipped;\n",
@@ -1809,10 +1814,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "TRB_KERNEL trb_k_priority_unit(__global trb_plan *plan, const __global trb_partial *partials, uint count) {\n",
   "  __local trb_partial space[TRB_GROUP];\n",
-  "  trb_partial sum = trb_nothing();\n",
-  "  uint i;\n",
-  "  for (i = TRB_LOCAL_ID; i < count; i += TRB_GROUP) trb_merge(&sum, partials[i]);\n",
-  "  sum = trb_merge_group(sum, space);\n",
+  "  const trb_partial sum = trb_merge_all(partials, count, space);\n",
   "  if (TRB_LOCAL_ID != 0) return;\n",
   "  plan->priority_unit = trb_priority_unit(sum.priority);\n",
   "  plan->scale_low = 0;\n",
@@ -2635,8 +2637,8 @@ static const char *const trb_cl_text[] = {
   "#endif\n",
 };
 #define TRB_CL_CORE_LINES 1462u   /* entries of trb_cl_text for user kernels: types, core, traversal */
-#define TRB_CL_LINES      2516u   /* all entries */
-#define TRB_CL_HASH       "38c6e95203d39b79"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_LINES      2518u   /* all entries */
+#define TRB_CL_HASH       "809248a7aa14f731"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {

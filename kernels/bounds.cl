@@ -31,6 +31,14 @@ static trb_partial trb_merge_group(trb_partial mine, __local trb_partial *space)
   return mine;
 }
 
+/* One work-group: what all of them found, to its first work-item. */
+static trb_partial trb_merge_all(const __global trb_partial *partials, uint count, __local trb_partial *space) {
+  trb_partial sum = trb_nothing();
+  uint i;
+  for (i = TRB_LOCAL_ID; i < count; i += TRB_GROUP) trb_merge(&sum, partials[i]);
+  return trb_merge_group(sum, space);
+}
+
 /* Boxes of all primitives; those of invalid ones are gaps, marked by TRBVH_NONE. */
 TRB_KERNEL trb_k_read(__global trb_plan *plan, const __global char *positions, const __global char *indices,
                       __global trbvh_node *refs, __global trb_partial *partials) {
@@ -61,10 +69,7 @@ TRB_KERNEL trb_k_read(__global trb_plan *plan, const __global char *positions, c
 /* One work-group: the scene's bounds from all of them. */
 TRB_KERNEL trb_k_grid(__global trb_plan *plan, const __global trb_partial *partials, uint count) {
   __local trb_partial space[TRB_GROUP];
-  trb_partial sum = trb_nothing();
-  uint i;
-  for (i = TRB_LOCAL_ID; i < count; i += TRB_GROUP) trb_merge(&sum, partials[i]);
-  sum = trb_merge_group(sum, space);
+  const trb_partial sum = trb_merge_all(partials, count, space);
   if (TRB_LOCAL_ID != 0) return;
   plan->grid = trb_make_grid(sum.bounds);
   plan->skipped = sum.skipped;

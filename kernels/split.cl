@@ -25,10 +25,7 @@ TRB_KERNEL trb_k_priorities(const __global trb_plan *plan, const __global char *
 /* One work-group: begins the search for the scale. */
 TRB_KERNEL trb_k_priority_unit(__global trb_plan *plan, const __global trb_partial *partials, uint count) {
   __local trb_partial space[TRB_GROUP];
-  trb_partial sum = trb_nothing();
-  uint i;
-  for (i = TRB_LOCAL_ID; i < count; i += TRB_GROUP) trb_merge(&sum, partials[i]);
-  sum = trb_merge_group(sum, space);
+  const trb_partial sum = trb_merge_all(partials, count, space);
   if (TRB_LOCAL_ID != 0) return;
   plan->priority_unit = trb_priority_unit(sum.priority);
   plan->scale_low = 0;
