@@ -2769,6 +2769,7 @@ enum {                                   /* names and values of CL/cl.h */
     const trb_cl_event *, trb_cl_event *, int32_t *)) \
   X(int32_t, EnqueueUnmapMemObject, (trb_cl_queue, trb_cl_mem, void *, uint32_t, const trb_cl_event *, trb_cl_event *)) \
   X(int32_t, EnqueueMarkerWithWaitList, (trb_cl_queue, uint32_t, const trb_cl_event *, trb_cl_event *)) \
+  X(int32_t, ReleaseEvent, (trb_cl_event)) \
   X(int32_t, Flush, (trb_cl_queue)) \
   X(int32_t, Finish, (trb_cl_queue))
 
@@ -2899,7 +2900,7 @@ enum {
 // >>device ----------------------------------------------------------------------------------------------------------
 /* Scratch memory: see >>stages. */
 #define TRB_CL_SCRATCH(X) \
-  X(state) X(nodes) X(refs) X(keys) X(sorted) X(counts) X(partials) X(ranges) X(groups) X(tasks) X(lists) X(marks) \
+  X(nodes) X(refs) X(keys) X(sorted) X(counts) X(partials) X(ranges) X(groups) X(tasks) X(lists) X(marks) \
   X(places) X(levels)
 enum {
   #define TRB_X(name) TRB_CL_SCRATCH_##name,
@@ -3408,7 +3409,10 @@ static void trb_cl_mark(trb_cl *cl, trb_cl_event *done) {
   if (done && !cl->error)
     trb_cl_check(cl, cl->api.EnqueueMarkerWithWaitList(cl->queue, 0, NULL, done), "clEnqueueMarkerWithWaitList");
   trb_cl_flush(cl);
-  if (done && cl->error) *done = NULL;
+  if (done && cl->error) {
+    if (*done) cl->api.ReleaseEvent(*done);
+    *done = NULL;
+  }
 }
 
 /* Memory that host and device share on a CPU, without a copy; elsewhere a buffer of its own. */
@@ -3485,7 +3489,6 @@ static void trb_cl_make_buffers(trb_cl_work *w) {
   #define TRB_X(member, bytes) \
     w->member = trb_cl_scratch(cl, TRB_CL_SCRATCH_##member, bytes); \
     w->b->stats.bytes_scratch += bytes;
-  TRB_X(state,    sizeof(trb_plan))
   TRB_X(nodes,    n * 2 * sizeof(trbvh_node))
   TRB_X(refs,     n * sizeof(trbvh_node))
   TRB_X(keys,     n * 8)
@@ -3506,8 +3509,9 @@ static void trb_cl_make_buffers(trb_cl_work *w) {
   if (cl->error) trbvh_cl_trim(&cl->hooks);          /* somebody else may need it more */
 }
 
-/* After the commands that use it: OpenCL keeps buffers until then. */
-static void trb_cl_free_mesh(trb_cl_work *w) {
+/* May come before the commands that use it are done: OpenCL keeps buffers until then. */
+static void trb_cl_free_input(trb_cl_work *w) {
+  trb_cl_release(w->cl, &w->state);
   if (w->owns_mesh) {
     trb_cl_release(w->cl, &w->positions);
     trb_cl_release(w->cl, &w->indices);
@@ -3521,7 +3525,8 @@ static void trb_cl_free_output(trb_cl_work *w) {
   trb_cl_release(w->cl, &w->out_triangles);
 }
 
-/* What the kernels need to know; positions' layout on the device is in the plan already. */
+/* What the kernels need to know; positions' layout on the device is in the plan already. A new buffer each time, as
+ * writing to an old one would have to wait for those who use it. */
 static void trb_cl_send_plan(trb_cl_work *w) {
   const trb_build *b = w->b;
   trb_plan *p = &w->plan;
@@ -3534,7 +3539,7 @@ static void trb_cl_send_plan(trb_cl_work *w) {
   p->split_max = b->split_max;
   p->index_size = b->input.indices ? b->input.index_size : 0;
   p->position_count = b->input.position_count;
-  trb_cl_write(w->cl, w->state, p, sizeof *p);
+  w->state = trb_cl_buffer(w->cl, TRB_CL_MEM_READ_WRITE | TRB_CL_MEM_COPY_HOST_PTR, sizeof *p, p);
 }
 
 /* ---- References ---- */
@@ -3844,7 +3849,7 @@ static trbvh_result trb_cl_build_tree(trbvh_device *device, trb_build *b, trbvh 
   }
   if (result) cl->api.Finish(cl->queue);             /* before memory that it shares goes */
   trb_cl_free_output(w);
-  trb_cl_free_mesh(w);
+  trb_cl_free_input(w);
   return result;
 }
 
@@ -3898,19 +3903,24 @@ static size_t trb_cl_size(trb_cl *cl, trb_cl_mem buffer) {
   return size;
 }
 
+/* Does a buffer hold count elements, from offset on? */
+static int trb_cl_holds(trb_cl *cl, trb_cl_mem buffer, size_t offset, size_t count, size_t stride, size_t element) {
+  const size_t size = trb_cl_size(cl, buffer);
+  return cl->error || (size >= element && offset <= size - element && count - 1 <= (size - element - offset) / stride);
+}
+
 /* Fills in what a build needs to know of a mesh in device memory. */
 static trbvh_result trb_cl_take_mesh(trb_cl_work *w, const trbvh_cl_geometry *geometry) {
   const trbvh_geometry *g = &w->b->input;
   const size_t vertices = g->indices ? g->position_count : (size_t)g->count * 3;
-  const size_t positions_end = geometry->position_offset + (vertices - 1) * g->position_stride + 12;
-  const size_t indices_end = g->indices ? geometry->index_offset + (size_t)g->count * 3 * g->index_size : 0;
   if (geometry->position_offset % 4 || g->position_stride % 4)
     return trb_fail(w->b, TRBVH_INVALID_ARGUMENT, "position_offset and position_stride must be multiples of 4", 0, 0, 0);
   if (g->indices && geometry->index_offset % g->index_size)
     return trb_fail(w->b, TRBVH_INVALID_ARGUMENT, "index_offset must be a multiple of index_size", 0, 0, 0);
-  if (trb_cl_size(w->cl, geometry->positions) < positions_end && !w->cl->error)
+  if (!trb_cl_holds(w->cl, geometry->positions, geometry->position_offset, vertices, g->position_stride, 12))
     return trb_fail(w->b, TRBVH_INVALID_ARGUMENT, "the buffer of positions is too small", 0, 0, 0);
-  if (g->indices && trb_cl_size(w->cl, geometry->indices) < indices_end && !w->cl->error)
+  if (g->indices && !trb_cl_holds(w->cl, geometry->indices, geometry->index_offset, (size_t)g->count * 3, g->index_size,
+                                  g->index_size))
     return trb_fail(w->b, TRBVH_INVALID_ARGUMENT, "the buffer of indices is too small", 0, 0, 0);
   w->positions = geometry->positions;
   w->indices = geometry->indices;
@@ -3983,7 +3993,7 @@ TRBVH_API trbvh_result trbvh_cl_build(trbvh_device *device, trbvh_cl_tree *tree,
     trb_cl_run_resident(w, tree, &result);
     trb_runner_stop(&b.runner);
     trb_cl_free_output(w);
-    trb_cl_free_mesh(w);
+    trb_cl_free_input(w);
   }
   if (!result) {
     tree->prim_count = b.input.count;
@@ -4017,7 +4027,6 @@ TRBVH_API trbvh_result trbvh_cl_refit(trbvh_device *device, trbvh_cl_tree *tree,
     return trb_cl_refuse(cl, tree ? "the tree has another number of triangles than the geometry" : "tree is NULL");
   if (tree->node_count) {
     const uint32_t pairs = tree->node_count / 2;
-    w->state = trb_cl_scratch(cl, TRB_CL_SCRATCH_state, sizeof(trb_plan));
     w->lists = trb_cl_scratch(cl, TRB_CL_SCRATCH_lists, (size_t)pairs * 4);
     w->levels = trb_cl_scratch(cl, TRB_CL_SCRATCH_levels, TRB_GPU_LEVELS * sizeof(trb_level));
     trb_cl_send_plan(w);
@@ -4033,6 +4042,7 @@ TRBVH_API trbvh_result trbvh_cl_refit(trbvh_device *device, trbvh_cl_tree *tree,
     for (level = TRBVH_MAX_DEPTH; level-- > 0;)
       trb_cl_launch(cl, TRB_CL_REFIT_refit_level, TRB_MIN(trb_cl_level_groups(level, pairs, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX),
                     tree->nodes, w->levels, w->lists, level);
+    trb_cl_free_input(w);
   }
   trb_cl_mark(cl, done);
   return trb_cl_result(cl, NULL);

@@ -42,13 +42,16 @@ install_packages() {
 
 # ---- build -----------------------------------------------------------------------------------------------------------
 compiler_flags() {   # of one test program, for a build without CMake
-  case $1 in test_hooks | test_golden) echo -DTRBVH_THREADS ;; esac
+  case $1 in
+    test_hooks | test_golden) echo -DTRBVH_THREADS ;;
+    test_cl*) echo -rdynamic ;;                    # its stand-in for OpenCL is found in the program itself
+  esac
 }
 build_directly() {
   jobs=0
   for name; do
     (${CC:-cc} ${CFLAGS--std=c99 -O2} $(compiler_flags "$name") -I"$root" "$here/$name.c" -o "$out/tests/$name" \
-      -lm -pthread) >"$out/tests/$name.log" 2>&1 &
+      -lm -pthread -ldl) >"$out/tests/$name.log" 2>&1 &
     jobs=$((jobs + 1))
     [ $((jobs % 2)) != 0 ] || wait
   done
