@@ -409,20 +409,57 @@ static void test_result_texts(void)
   CHECK(TRBVH_OK == 0 && strcmp(trbvh_result_text(TRBVH_OK), "success") == 0);
 }
 
-/* No backend in this version: a device is not used, says the message, or refused where there may be no fallback. */
-static void test_device_without_backend(void)
+/* A backend that always fails, in the way that is asked for. */
+static trbvh_result device_fails;
+static trbvh_result fail_to_build(trbvh_device *device, trb_build *b, trbvh *bvh)
 {
+  (void)device;
+  (void)bvh;
+  b->stats.max_depth = 99;                     /* nothing of this may be left */
+  return trb_fail(b, device_fails, "the device is gone", 0, 0, 0);
+}
+static trbvh_result fail_to_trace(trbvh_device *device, trb_build *b, const trb_batch *batch)
+{
+  (void)device;
+  (void)batch;
+  return trb_fail(b, device_fails, "the device is gone", 0, 0, 0);
+}
+
+/* C does the work of a device that fails, and the message says why; where there may be no fallback, and for errors that
+ * are not the device's, it is an error. */
+static void test_device_that_fails(void)
+{
+  static const trbvh_result results[] = {TRBVH_NO_DEVICE, TRBVH_DEVICE_ERROR, TRBVH_OUT_OF_DEVICE_MEMORY, TRBVH_CANCELLED,
+      TRBVH_OUT_OF_MEMORY, TRBVH_BAD_GEOMETRY};
+  const trbvh_ray ray = {{0, 0, -5}, 0, {0, 0, 1}, 0};
+  trbvh_hit hit;
   input in;
-  int anything = 0;
+  trbvh_device device;
   trbvh bvh;
+  unsigned i, strict;
   memset(&bvh, 0, sizeof bvh);
   input_make(&in);
-  in.o.device = (trbvh_device *)(void *)&anything;
-  CHECK(trbvh_build(&bvh, &in.g, &in.o) == TRBVH_OK && bvh.node_count > 0 && in.stats.on_device == 0
-      && in.stats.message[0]);
-  in.o.flags = TRBVH_NO_FALLBACK;
-  CHECK(trbvh_build(&bvh, &in.g, &in.o) == TRBVH_NO_DEVICE && tree_is_empty(&bvh) && in.stats.message[0]
-      && in.memory.live == 0);
+  device.build = fail_to_build;
+  device.trace = fail_to_trace;
+  in.o.device = &device;
+  for (i = 0; i < sizeof results / sizeof results[0]; ++i)
+    for (strict = 0; strict < 2; ++strict) {
+      const int falls_back = i < 3 && !strict;
+      trbvh_result result;
+      CONTEXT("%s, strict %u", trbvh_result_text(results[i]), strict);
+      device_fails = results[i];
+      in.o.flags = strict ? TRBVH_NO_FALLBACK : 0;
+      result = trbvh_build(&bvh, &in.g, &in.o);
+      CHECK(result == (falls_back ? TRBVH_OK : results[i]) && tree_is_empty(&bvh) == !falls_back);
+      CHECK(in.stats.on_device == 0 && (in.stats.max_depth != 99 || !falls_back));
+      CHECK(!strcmp(in.stats.message, "the device is gone"));
+      CHECK(falls_back || in.memory.live == 0);
+      if (!falls_back) continue;
+      result = trbvh_intersect_n(&bvh, &ray, &hit, 1, &in.o);
+      CHECK(result == TRBVH_OK && in.stats.on_device == 0 && !strcmp(in.stats.message, "the device is gone"));
+      in.o.flags = TRBVH_NO_FALLBACK;
+      CHECK(trbvh_intersect_n(&bvh, &ray, &hit, 1, &in.o) == results[i]);
+    }
   trbvh_free(&bvh);
   input_free(&in);
 }
@@ -463,7 +500,7 @@ int main(int argc, char **argv)
   RUN(test_not_finite_boxes);
   RUN(test_unused_vertices_do_not_matter);
   RUN(test_result_texts);
-  RUN(test_device_without_backend);
+  RUN(test_device_that_fails);
   RUN(test_query_arguments);
   return test_finish();
 }
