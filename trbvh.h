@@ -1759,6 +1759,7 @@ TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbv
 #define TRB_GPU_CHUNKS  16u              /* ... and so many chunks that the next one joins */
 #define TRB_GPU_LEVELS  128u             /* more than any tree has; they are listed one by one on a GPU */
 #define TRB_ROOTS_MAX   (1u << 20)       /* treelets of one launch: none lasts longer than a watchdog's patience */
+#define TRB_CPU_RAYS    64u              /* that a work-item of a CPU traces */
 #define TRB_JOB_STEP    64u              /* every so many-th work-group of a CPU gets a heavy job */
 #define TRB_CANDIDATES  16u              /* scales tried at once */
 

@@ -1521,6 +1521,7 @@ static const char *const trb_cl_text[] = {
   "#define TRB_GPU_CHUNKS  16u\n",
   "#define TRB_GPU_LEVELS  128u\n",
   "#define TRB_ROOTS_MAX   (1u << 20)\n",
+  "#define TRB_CPU_RAYS    64u\n",
   "#define TRB_JOB_STEP    64u\n",
   "#define TRB_CANDIDATES  16u\n",
   "\n",
@@ -2604,7 +2605,7 @@ static const char *const trb_cl_text[] = {
   "#ifdef TRB_WITH_TRACE\n",
   "#line 5 \"kernels/trace.cl\"\n",
   "#ifdef TRB_CPU\n",
-  "  #define TRB_RAYS 64u\n",
+  "  #define TRB_RAYS TRB_CPU_RAYS\n",
   "#else\n",
   "  #define TRB_RAYS 1u\n",
   "#endif\n",
@@ -2636,9 +2637,9 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "#endif\n",
 };
-#define TRB_CL_CORE_LINES 1462u   /* entries of trb_cl_text for user kernels: types, core, traversal */
-#define TRB_CL_LINES      2518u   /* all entries */
-#define TRB_CL_HASH       "809248a7aa14f731"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_CORE_LINES 1463u   /* entries of trb_cl_text for user kernels: types, core, traversal */
+#define TRB_CL_LINES      2519u   /* all entries */
+#define TRB_CL_HASH       "61299565709afdc1"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
@@ -3446,15 +3447,17 @@ static trb_cl_mem trb_cl_input(trb_cl *cl, const void *host, size_t size) {
 // >>stages ---- a build: buffers, and the kernels of every stage in the order of trbvh.h ------------------------------
 /* Buffers are shared by what comes one after the other; R is b->ref_max:
  *
- *     nodes  64 R   references before splitting, and while gaps are closed   build nodes
- *     refs   32 R   references                               CPU: treelets' lists; spare nodes of the collapse
- *     keys    8 R   priorities   keys                        CPU: nodes above groups; spare words
- *     sorted  8 R   sums of splits   keys   GPU: what splits wait for        spare words
+ *     nodes  64 R   references before splitting, and while gaps are closed; build nodes
+ *     refs   32 R   references; CPU: treelets' lists; spare nodes of the collapse
+ *     keys    8 R   priorities; keys; CPU: nodes above groups; spare words of the collapse
+ *     sorted  8 R   what splitting found; keys; GPU: what splits wait for; spare words of the collapse
  *     counts        of tiles; of digits; of waiting splits
  *     GPU: lists 4 R and marks 4 R: waiting splits; nodes by level, where their references begin; places 24 R
  *     CPU: ranges, groups, tasks
  *
- * So that no buffer is larger than the largest array, each has its own. The device keeps them for the next build. */
+ * Each is a buffer of its own: of the 144 bytes and the some 80 of the result, 64 are in the largest, which is little
+ * more than the quarter of the memory that CL_DEVICE_MAX_MEM_ALLOC_SIZE is at least. The device keeps them for the next
+ * build. */
 typedef struct trb_cl_work {
   trb_cl     *cl;
   trb_build  *b;
@@ -3853,14 +3856,14 @@ static trbvh_result trb_cl_build_tree(trbvh_device *device, trb_build *b, trbvh 
   return result;
 }
 
-/* Rays in launches of so many: see trb_cl_round. */
+/* Rays of one launch: see TRB_ROOTS_MAX. */
 #define TRB_CL_RAYS_MAX ((uint64_t)1 << 20)
 
 static void trb_cl_trace(trb_cl *cl, int kernel, const trbvh_cl_tree *tree, trb_cl_mem rays, trb_cl_mem out, uint64_t count) {
   uint64_t begin, end;
   for (begin = 0; begin < count; begin = end) {
     end = TRB_MIN(count, begin + TRB_CL_RAYS_MAX);
-    trb_cl_launch(cl, kernel, trb_blocks((uint32_t)(end - begin), cl->cpu ? 64 : TRB_GPU_GROUP), tree->nodes,
+    trb_cl_launch(cl, kernel, trb_blocks((uint32_t)(end - begin), cl->cpu ? TRB_CPU_RAYS : TRB_GPU_GROUP), tree->nodes,
                   tree->triangles, rays, out, (uint32_t)(tree->node_count == 0), begin, end);
     trb_cl_flush(cl);
   }

@@ -3,7 +3,7 @@
 #include "query.cl"
 
 #ifdef TRB_CPU
-  #define TRB_RAYS 64u                               /* a work-item's, in a row */
+  #define TRB_RAYS TRB_CPU_RAYS                      /* a work-item's, in a row */
 #else
   #define TRB_RAYS 1u
 #endif
