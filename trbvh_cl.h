@@ -3752,8 +3752,9 @@ static trbvh_result trb_cl_run_to_counts(trb_cl_work *w) {
   }
   TRB_CL_STAGE(0.1f, ms_collapse, (trb_cl_count_tree(w), trb_cl_read(w->cl, w->state, &w->plan, sizeof w->plan)))
   if (result) return result;
-  if (p->ref_count > b->ref_max || p->prims > p->ref_count || p->leaves > p->prims || p->max_depth > TRBVH_MAX_DEPTH ||
-      p->skipped > b->input.count || (p->ref_count == 0) != (p->leaves == 0))
+  if (p->skipped > b->input.count || p->prims < b->input.count - p->skipped || p->prims > p->ref_count ||
+      p->ref_count > b->ref_max || p->leaves > p->prims || (p->prims == 0) != (p->leaves == 0) ||
+      p->max_depth > TRBVH_MAX_DEPTH)
     return trb_fail(w->b, TRBVH_DEVICE_ERROR, "the device miscalculates: %u references, %u leaves, depth %u", p->ref_count,
                     p->leaves, p->max_depth);
   if (p->bad != TRBVH_NONE)
