@@ -109,6 +109,7 @@ typedef struct stub_state {
   int         no_platforms, no_devices, fake_gpu, refuse_build;
   uint64_t    little_memory;          /* bytes of the device, and of a buffer; 0 = what there is */
   size_t      group;                  /* work-items of the largest group so far */
+  int         pending;                /* something was enqueued and not waited for */
   unsigned    misused;
   char        misuse[128];
 } stub_state;
@@ -173,6 +174,7 @@ static void stub_misuse(const char *call, const char *what)
 static int stub_event(int error, int kind, void **event)
 {
   if (!error && event) ++stub.live[kind];
+  if (!error) stub.pending = 1;
   return error;
 }
 static int stub_answer(const void *value, size_t bytes, size_t size, void *out, size_t *needed)
@@ -285,8 +287,10 @@ int clEnqueueReadBuffer(void *queue, void *buffer, unsigned blocking, size_t off
   int e = stub_enter(STUB_clEnqueueReadBuffer);
   stub.waits += blocking != 0;
   if (e) return e;
-  return stub_event(real_cl.clEnqueueReadBuffer(queue, buffer, blocking, offset, size, out, waits, wait, event),
-      STUB_EVENT, event);
+  e = stub_event(real_cl.clEnqueueReadBuffer(queue, buffer, blocking, offset, size, out, waits, wait, event), STUB_EVENT,
+      event);
+  if (blocking) stub.pending = 0;
+  return e;
 }
 int clEnqueueWriteBuffer(void *queue, void *buffer, unsigned blocking, size_t offset, size_t size, const void *in,
     unsigned waits, void *const *wait, void **event)
@@ -294,8 +298,10 @@ int clEnqueueWriteBuffer(void *queue, void *buffer, unsigned blocking, size_t of
   int e = stub_enter(STUB_clEnqueueWriteBuffer);
   stub.waits += blocking != 0;
   if (e) return e;
-  return stub_event(real_cl.clEnqueueWriteBuffer(queue, buffer, blocking, offset, size, in, waits, wait, event),
-      STUB_EVENT, event);
+  e = stub_event(real_cl.clEnqueueWriteBuffer(queue, buffer, blocking, offset, size, in, waits, wait, event), STUB_EVENT,
+      event);
+  if (blocking) stub.pending = 0;
+  return e;
 }
 void *clEnqueueMapBuffer(void *queue, void *buffer, unsigned blocking, uint64_t flags, size_t offset, size_t size,
     unsigned waits, void *const *wait, void **event, int *error)
@@ -306,6 +312,7 @@ void *clEnqueueMapBuffer(void *queue, void *buffer, unsigned blocking, uint64_t 
   if (!e) mapped = real_cl.clEnqueueMapBuffer(queue, buffer, blocking, flags, offset, size, waits, wait, event, error);
   else if (error) *error = e;
   if (mapped) stub_event(0, STUB_EVENT, event);
+  if (mapped && blocking) stub.pending = 0;
   return mapped;
 }
 /* A device that is lost does not go on using the host's memory: these do their work even where they fail. */
@@ -319,6 +326,7 @@ int clFinish(void *queue)
 {
   int e = stub_enter(STUB_clFinish), done = stub_load() ? real_cl.clFinish(queue) : CL_NO_PLATFORM;
   ++stub.waits;
+  stub.pending = 0;
   return e ? e : done;
 }
 int clWaitForEvents(unsigned count, void *const *events)
