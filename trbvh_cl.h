@@ -2064,7 +2064,7 @@ static const char *const trb_cl_text[] = {
   "  const ulong left = trb_split_after(curve, first - 1), right = trb_split_after(curve, last);\n",
   "  if (first == 0 && last == curve->count - 1) {\n",
   "    nodes[0] = node;\n",
-  "  } else if (left <= right) {\n",
+  "  } else if (first > 0 && left <= right) {\n",
   "    nodes[2 * first + 1] = node;\n",
   "    waits[first - 1].last = last + 1;\n",
   "  } else {\n",
@@ -2639,7 +2639,7 @@ static const char *const trb_cl_text[] = {
 };
 #define TRB_CL_CORE_LINES 1463u   /* entries of trb_cl_text for user kernels: types, core, traversal */
 #define TRB_CL_LINES      2519u   /* all entries */
-#define TRB_CL_HASH       "61299565709afdc1"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_HASH       "abc56838c1cabd6f"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {

@@ -41,7 +41,7 @@ static void trb_hang(const trb_curve *curve, __global trbvh_node *nodes, __globa
   const ulong left = trb_split_after(curve, first - 1), right = trb_split_after(curve, last);
   if (first == 0 && last == curve->count - 1) {
     nodes[0] = node;
-  } else if (left <= right) {
+  } else if (first > 0 && left <= right) {           /* the middle of the scene may be as shallow as its ends */
     nodes[2 * first + 1] = node;                     /* the right child of split first - 1 */
     waits[first - 1].last = last + 1;
   } else {
