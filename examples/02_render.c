@@ -41,7 +41,8 @@ typedef struct preset {
 // >>command line --------------------------------------------------------------------------------------------
 enum { OPTION_QUALITY, OPTION_SPLITS, OPTION_THREADS, OPTION_DEVICE, OPTION_SIZE, OPTION_OUT, OPTIONS };
 static const ex_option options_known[OPTIONS] = {
-  {"--quality", 0}, {"--splits", 0}, {"--threads", 0}, {"--device", 1}, {"--size", 0}, {"--out", 0}
+  {"--quality", EX_VALUE}, {"--splits", EX_VALUE}, {"--threads", EX_VALUE}, {"--device", EX_VALUE_OR_NONE},
+  {"--size", EX_VALUE}, {"--out", EX_VALUE}
 };
 
 static void set_option(void *user, int option, const char *value)

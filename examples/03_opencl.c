@@ -18,7 +18,9 @@ static const char usage[] =
 
 typedef struct settings { const char *mesh, *cache; uint32_t threads, width, height; } settings;
 enum { OPTION_THREADS, OPTION_SIZE, OPTION_CACHE, OPTIONS };
-static const ex_option options_known[OPTIONS] = {{"--threads", 0}, {"--size", 0}, {"--cache", 0}};
+static const ex_option options_known[OPTIONS] = {
+  {"--threads", EX_VALUE}, {"--size", EX_VALUE}, {"--cache", EX_VALUE}
+};
 
 static void set_option(void *user, int option, const char *value)
 {

@@ -1385,7 +1385,8 @@ static inline void ex_parse_size(const char *text, const char *option, uint32_t 
   if (*end != 'x') ex_die("%s takes WxH, like 960x640, not '%s'", option, text);
   *height = ex_parse_count(end + 1, option, 4096, NULL);
 }
-typedef struct ex_option { const char *name; int value_is_optional; } ex_option;   /* value left out: "" */
+typedef struct ex_option { const char *name; int value; } ex_option;
+enum { EX_VALUE, EX_VALUE_OR_NONE, EX_NO_VALUE };   /* where there is none, set gets "" */
 /* Calls set(user, option's number or -1 for an argument that is none, value) for each argument. */
 static inline void ex_arguments(int argc, char **argv, const char *usage, const ex_option *options, int count,
                                 void (*set)(void *user, int option, const char *value), void *user)
@@ -1402,7 +1403,8 @@ static inline void ex_arguments(int argc, char **argv, const char *usage, const 
     }
     while (option < count && strcmp(argv[i], options[option].name)) option++;
     if (option == count) ex_die("unknown option '%s'; --help lists them", argv[i]);
-    if (options[option].value_is_optional) has_value = has_value && argv[i + 1][0] != '-';
+    if (options[option].value == EX_NO_VALUE) has_value = 0;
+    else if (options[option].value == EX_VALUE_OR_NONE) has_value = has_value && argv[i + 1][0] != '-';
     else if (!has_value) ex_die("%s needs a value", argv[i]);
     set(user, option, has_value ? argv[i + 1] : "");
     i += has_value;

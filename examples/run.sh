@@ -1,7 +1,7 @@
 #!/bin/sh
 # Builds 02_render.c and draws a mesh, or the built-in scene:
 #   sh examples/run.sh [mesh.obj|.ply|.stl] [options: --help lists them]
-# Then 03_opencl.c, with the same mesh, and 04_own_kernel.c, which say so where there is no OpenCL.
+# Then 03_opencl.c, with the same mesh, and 04_own_kernel.c, which say so where there is no OpenCL; and bench.c --quick.
 # CC chooses the compiler, TRBVH_OUT the folder for the programs and the pictures (build/ in the project).
 set -eu
 root=$(cd "$(dirname "$0")/.." && pwd)
@@ -32,7 +32,7 @@ fi
 mkdir -p "$out"
 libraries="-lm -pthread"
 if [ "$(uname)" = Linux ]; then libraries="$libraries -ldl"; fi   # its own library before glibc 2.34
-for name in 02_render 03_opencl 04_own_kernel; do
+for name in 02_render 03_opencl 04_own_kernel bench; do
   $compiler -O3 "$root/examples/$name.c" -o "$out/$name" $libraries
 done
 case " $* " in *" --help "*) exec "$out/02_render" --help ;; esac
@@ -43,3 +43,5 @@ echo
 "$out/03_opencl" ${mesh:+"$mesh"}
 echo
 "$out/04_own_kernel" "$out/own_kernel.png"
+echo
+"$out/bench" --quick ${mesh:+"$mesh"}

@@ -79,9 +79,7 @@ TRB_KERNEL trb_k_grid(__global trb_plan *plan, const __global trb_partial *parti
   plan->ref_count = plan->prim_count - sum.skipped;
 }
 
-/* ---- Closing the gaps, where there are any: count them in each tile, sum up, move ---- */
-static bool trb_has_gaps(const __global trb_plan *plan) { return plan->ref_count != plan->slots; }
-
+/* How many references each tile has, where there are gaps. */
 TRB_KERNEL trb_k_count_refs(const __global trb_plan *plan, const __global trbvh_node *refs, __global uint *counts) {
   __local uint space[TRB_GROUP];
   const uint first = TRB_GROUP_ID * TRB_TILE, end = min(plan->slots, first + TRB_TILE);
@@ -90,27 +88,6 @@ TRB_KERNEL trb_k_count_refs(const __global trb_plan *plan, const __global trbvh_
   for (i = first + TRB_LOCAL_ID; i < end; i += TRB_GROUP) count += refs[i].first != TRBVH_NONE;
   trb_scan(count, space, &total);
   if (TRB_LOCAL_ID == 0) counts[TRB_GROUP_ID] = total;
-}
-
-TRB_KERNEL trb_k_move_refs(const __global trb_plan *plan, const __global trbvh_node *refs, const __global uint *starts,
-                           __global trbvh_node *moved) {
-  __local uint space[TRB_GROUP];
-  const uint first = TRB_GROUP_ID * TRB_TILE, end = min(plan->slots, first + TRB_TILE);
-  uint i, start = starts[TRB_GROUP_ID], total;
-  if (!trb_has_gaps(plan)) return;
-  for (i = first; i < end; i += TRB_GROUP) {
-    const uint mine = i + TRB_LOCAL_ID;
-    const bool valid = mine < end && refs[mine].first != TRBVH_NONE;
-    const uint before = trb_scan(valid, space, &total);
-    if (valid) moved[start + before] = refs[mine];
-    start += total;
-  }
-}
-
-TRB_KERNEL trb_k_return_refs(const __global trb_plan *plan, const __global trbvh_node *moved, __global trbvh_node *refs) {
-  uint i;
-  if (!trb_has_gaps(plan)) return;
-  TRB_FOR(i, plan->ref_count) refs[i] = moved[i];
 }
 
 /* ---- Prefix sums ---- */

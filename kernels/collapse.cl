@@ -2,52 +2,30 @@
  * right size, nodes and primitives. */
 #include "shape.cl"
 
-static trb_collapser trb_plan_collapser(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *spare,
-                                        __global uint *keys, __global uint *sorted) {
-  trb_collapser c;
-  c.nodes = nodes;
-  c.spare = spare;
-  c.words[0] = keys;
-  c.words[1] = sorted;
-  c.costs = plan->costs;
-  c.cost_node = plan->cost_node;
-  c.cost_prim = plan->cost_prim;
-  c.split = plan->split_max != 0;
-  c.out = 0;
-  c.prims = 0;
-  return c;
-}
-
-/* The same for the second walk. */
-static trb_collapser trb_plan_emitter(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *out,
-                                      __global uint *prims) {
-  trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0, 0);
-  c.out = out;
-  c.prims = prims;
-  return c;
-}
-
 static void trb_emit_padding(__global trbvh_node *out) {
   uint k;
   for (k = 0; k < 3; k++) out[1].min[k] = out[1].max[k] = 0;
   out[1].first = out[1].count = 0;
 }
 
-#ifdef TRB_CPU
-TRB_KERNEL trb_k_find_tasks(__global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *spare,
-                            __global uint *keys, __global uint *sorted, __global trb_task *tasks) {
-  const trb_collapser c = trb_plan_collapser(plan, nodes, spare, keys, sorted);
+/* One work-item. */
+TRB_KERNEL trb_k_find_tasks(__global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys, __global ulong *sorted,
+                            __global trb_task *tasks, __global trb_group *groups) {
+  const trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);
   float sah = 0;
+  if (TRB_LOCAL_ID != 0) return;
   plan->tasks = plan->ref_count ? trb_find_tasks(&c, tasks, &sah) : 0;
+  plan->groups = trb_find_groups(tasks, plan->tasks, groups);
   plan->sah = sah;
   plan->root_area = trb_sah_term(nodes[0], 1);
 }
 
-TRB_KERNEL trb_k_count_tasks(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *spare,
-                             __global uint *keys, __global uint *sorted, __global trb_task *tasks) {
-  const trb_collapser c = trb_plan_collapser(plan, nodes, spare, keys, sorted);
+#ifdef TRB_CPU
+TRB_KERNEL trb_k_settle_groups(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
+                               __global ulong *sorted, __global trb_task *tasks, const __global trb_group *groups) {
+  const trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);
   uint i;
-  TRB_FOR_JOBS(i, plan->tasks) trb_count_task(&c, &tasks[i]);
+  TRB_FOR_JOBS(i, plan->groups) trb_settle_group(&c, tasks, groups[i]);
 }
 
 TRB_KERNEL trb_k_sum_tasks(__global trb_plan *plan, const __global trb_task *tasks) {
@@ -65,21 +43,36 @@ TRB_KERNEL trb_k_sum_tasks(__global trb_plan *plan, const __global trb_task *tas
   plan->sah = sah;
 }
 
-TRB_KERNEL trb_k_emit_top(const __global trb_plan *plan, __global trbvh_node *nodes, __global trb_task *tasks,
-                          __global trbvh_node *out, __global uint *prims) {
-  const trb_collapser c = trb_plan_emitter(plan, nodes, out, prims);
+TRB_KERNEL trb_k_emit_top(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
+                          __global ulong *sorted, __global trb_task *tasks, __global trbvh_node *out, __global uint *prims) {
+  const trb_collapser c = trb_plan_emitter(plan, nodes, keys, sorted, out, prims);
   trb_emit_padding(out);
   trb_emit_top(&c, tasks);
 }
 
-TRB_KERNEL trb_k_emit_tasks(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_task *tasks,
-                            __global trbvh_node *out, __global uint *prims) {
-  const trb_collapser c = trb_plan_emitter(plan, nodes, out, prims);
+TRB_KERNEL trb_k_emit_tasks(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
+                            __global ulong *sorted, const __global trb_task *tasks, __global trbvh_node *out,
+                            __global uint *prims) {
+  const trb_collapser c = trb_plan_emitter(plan, nodes, keys, sorted, out, prims);
   uint i;
   TRB_FOR_JOBS(i, plan->tasks) trb_emit_task(&c, tasks[i]);
 }
 #else
 /* Inner nodes are listed level by level; their sums go from the bottom up, their places from the top down. */
+static uint trb_count_prims(const trb_collapser *c, trbvh_node leaf) {
+  uint prims[TRB_MAX_LEAF];
+  return c->split ? trb_leaf_prims(c, leaf, prims) : trb_count(leaf.count);
+}
+
+/* Writes a leaf whose primitives begin at `first`; returns how many they are. */
+static uint trb_emit_leaf(const trb_collapser *c, trbvh_node node, uint dst, uint first) {
+  uint prims[TRB_MAX_LEAF], i;
+  node.count = trb_leaf_prims(c, node, prims);
+  node.first = first;
+  c->out[dst] = node;
+  for (i = 0; i < node.count; i++) c->prims[first + i] = prims[i];
+  return node.count;
+}
 
 /* One work-group. first_refs: where each listed node's references begin. */
 TRB_KERNEL trb_k_first_inner(const __global trb_plan *plan, const __global trbvh_node *nodes, __global trb_level *levels,
@@ -116,20 +109,20 @@ static void trb_list_inner(const trb_collapser *c, __global trb_level *levels, _
   if (item == 0) levels[level + 1].first = next;
 }
 
-TRB_KERNEL trb_k_list_inner(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *spare,
-                            __global uint *keys, __global uint *sorted, __global trb_level *levels, __global uint *list,
+TRB_KERNEL trb_k_list_inner(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
+                            __global ulong *sorted, __global trb_level *levels, __global uint *list,
                             __global uint *first_refs, uint level) {
   __local uint space[2];
-  const trb_collapser c = trb_plan_collapser(plan, nodes, spare, keys, sorted);
+  const trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);
   trb_list_inner(&c, levels, list, first_refs, level, (uint)get_global_id(0), (uint)get_global_size(0), space);
 }
 
 /* One work-group: all levels from this one on. */
-TRB_KERNEL trb_k_list_rest(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *spare,
-                           __global uint *keys, __global uint *sorted, __global trb_level *levels, __global uint *list,
+TRB_KERNEL trb_k_list_rest(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
+                           __global ulong *sorted, __global trb_level *levels, __global uint *list,
                            __global uint *first_refs, uint level) {
   __local uint space[2];
-  const trb_collapser c = trb_plan_collapser(plan, nodes, spare, keys, sorted);
+  const trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);
   for (; level + 1 < TRB_GPU_LEVELS && levels[level].count; level++) {
     trb_list_inner(&c, levels, list, first_refs, level, TRB_LOCAL_ID, TRB_GROUP, space);
     TRB_SYNC();
@@ -161,7 +154,7 @@ static void trb_count_inner(const trb_collapser *c, __global trb_place *places, 
 
 TRB_KERNEL trb_k_count_inner(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,
                              const __global uint *list, __global trb_place *places, uint level) {
-  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0, 0);
+  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0);
   const uint first = levels[level].first, count = levels[level].count;
   uint i;
   TRB_FOR(i, count) trb_count_inner(&c, places, list[first + i]);
@@ -170,7 +163,7 @@ TRB_KERNEL trb_k_count_inner(const __global trb_plan *plan, __global trbvh_node 
 /* One work-group: all levels from the lowest one up to this. */
 TRB_KERNEL trb_k_count_rest(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,
                             const __global uint *list, __global trb_place *places, uint level) {
-  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0, 0);
+  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0);
   uint lowest = level, i;
   while (lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;
   for (lowest++; lowest-- > level;) {
@@ -183,7 +176,7 @@ TRB_KERNEL trb_k_count_rest(const __global trb_plan *plan, __global trbvh_node *
 /* One work-item is enough. */
 TRB_KERNEL trb_k_sum_inner(__global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,
                            __global trb_place *places) {
-  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0, 0);
+  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0);
   uint depth = 0;
   if (TRB_LOCAL_ID != 0) return;
   plan->leaves = plan->prims = plan->max_depth = 0;
@@ -243,7 +236,7 @@ static void trb_place_children(const trb_collapser *c, __global trb_place *place
 
 TRB_KERNEL trb_k_emit_root(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *out,
                            __global uint *prims) {
-  const trb_collapser c = trb_plan_emitter(plan, nodes, out, prims);
+  const trb_collapser c = trb_plan_emitter(plan, nodes, 0, 0, out, prims);
   if (TRB_LOCAL_ID != 0) return;
   trb_emit_padding(out);
   if (trb_is_leaf(nodes[0].count)) trb_emit_leaf(&c, nodes[0], 0, 0);
@@ -253,7 +246,7 @@ TRB_KERNEL trb_k_emit_root(const __global trb_plan *plan, __global trbvh_node *n
 TRB_KERNEL trb_k_emit_level(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,
                             const __global uint *list, __global trb_place *places, __global trbvh_node *out,
                             __global uint *prims, uint level) {
-  const trb_collapser c = trb_plan_emitter(plan, nodes, out, prims);
+  const trb_collapser c = trb_plan_emitter(plan, nodes, 0, 0, out, prims);
   const uint first = levels[level].first, count = levels[level].count;
   uint i;
   TRB_FOR(i, count) trb_place_children(&c, places, list[first + i]);

@@ -1,14 +1,30 @@
 /* Sort keys: Morton codes and references' numbers (trbvh.h, >>sort). */
 #include "shape.cl"
 
-/* high: the references stand in the order of the keys that are there, and get those of the other half of the code. */
-TRB_KERNEL trb_k_keys(const __global trb_plan *plan, const __global trbvh_node *refs, __global ulong *keys, uint high) {
+/* Of all references, without the gaps. starts: how many there are in the tiles before. */
+TRB_KERNEL trb_k_keys(const __global trb_plan *plan, const __global trbvh_node *refs, const __global uint *starts,
+                      __global ulong *keys) {
+  __local uint space[TRB_GROUP];
+  const trb_grid grid = plan->grid;
+  const trb_key_form form = plan->form;
+  const uint first = TRB_GROUP_ID * TRB_TILE, end = min(plan->slots, first + TRB_TILE);
+  uint i, at = trb_has_gaps(plan) ? starts[TRB_GROUP_ID] : first, total = TRB_GROUP;
+  for (i = first; i < end; i += TRB_GROUP, at += total) {
+    const uint mine = i + TRB_LOCAL_ID;
+    const bool valid = mine < end && refs[mine].first != TRBVH_NONE;
+    const uint before = trb_has_gaps(plan) ? trb_scan(valid, space, &total) : TRB_LOCAL_ID;
+    if (valid) keys[at + before] = trb_key(trb_box_code(refs[mine], grid), mine, form, 0);
+  }
+}
+
+/* The keys with the high half of the codes, in the order of those with the low half. */
+TRB_KERNEL trb_k_high_keys(const __global trb_plan *plan, const __global trbvh_node *refs, __global ulong *keys) {
   const trb_grid grid = plan->grid;
   const trb_key_form form = plan->form;
   const uint count = plan->ref_count;
   uint i;
   TRB_FOR(i, count) {
-    const uint ref = high ? trb_key_ref(keys[i], form) : i;
-    keys[i] = trb_key(refs[ref], ref, grid, form, high);
+    const uint ref = trb_key_ref(keys[i], form);
+    keys[i] = trb_key(trb_box_code(refs[ref], grid), ref, form, 1);
   }
 }

@@ -9,6 +9,6 @@ TRB_KERNEL trb_k_triangles(const __global trb_plan *plan, const __global char *p
   trb_make_triangles(&mesh, prims, first, min(count, first + TRB_BLOCK), triangles);
 #else
   uint i;
-  TRB_FOR(i, count) trb_make_triangle(&mesh, prims[i], &triangles[i]);
+  TRB_FOR(i, count) trb_make_triangle(&mesh, trb_mesh_form(&mesh), prims[i], &triangles[i]);
 #endif
 }

@@ -70,6 +70,33 @@ static trb_mesh trb_plan_mesh(const __global trb_plan *plan, const __global char
   return mesh;
 }
 
+/* Slots of references are gaps where a primitive is invalid, or has used fewer splits than it had. */
+static bool trb_has_gaps(const __global trb_plan *plan) { return plan->ref_count != plan->slots; }
+
+/* What the collapse needs to know; keys and sorted are scratch memory by then, for those who need some. */
+static trb_collapser trb_plan_collapser(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
+                                        __global ulong *sorted) {
+  trb_collapser c;
+  c.nodes = nodes;
+  c.words = trb_split_words(keys, sorted, plan->ref_count);
+  c.costs = plan->costs;
+  c.cost_node = plan->cost_node;
+  c.cost_prim = plan->cost_prim;
+  c.split = plan->split_max != 0;
+  c.out = 0;
+  c.prims = 0;
+  return c;
+}
+
+/* The same once the result is allocated. */
+static trb_collapser trb_plan_emitter(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
+                                      __global ulong *sorted, __global trbvh_node *out, __global uint *prims) {
+  trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);
+  c.out = out;
+  c.prims = prims;
+  return c;
+}
+
 /* ---- Lists of nodes by level: the root's is 0 ----
  * They are how a tree is worked on without waiting: every kernel takes one level, whose nodes are independent. The
  * lists stand one after the other; their order within a level is chance, and nothing depends on it. Below the wide

@@ -7,16 +7,16 @@
 TRB_KERNEL trb_k_count_digits(const __global trb_plan *plan, const __global ulong *keys, __global uint *histograms, uint shift) {
   const uint first = TRB_GROUP_ID * TRB_SORT_BLOCK;
   const uint count = first < plan->ref_count ? min(plan->ref_count - first, TRB_SORT_BLOCK) : 0;
-  trb_count_digits(keys + first, count, shift, histograms + (size_t)TRB_GROUP_ID * TRB_DIGITS);
+  trb_count_digits(keys + first, count, shift, TRB_DIGITS, histograms + (size_t)TRB_GROUP_ID * TRB_DIGITS);
 }
 
-TRB_KERNEL trb_k_place_digits(__global uint *histograms, uint blocks) { trb_place_digits(histograms, blocks); }
+TRB_KERNEL trb_k_place_digits(__global uint *histograms, uint blocks) { trb_place_digits(histograms, blocks, TRB_DIGITS); }
 
 TRB_KERNEL trb_k_scatter_keys(const __global trb_plan *plan, const __global ulong *keys, __global uint *histograms,
                               __global ulong *sorted, uint shift) {
   const uint first = TRB_GROUP_ID * TRB_SORT_BLOCK;
   const uint count = first < plan->ref_count ? min(plan->ref_count - first, TRB_SORT_BLOCK) : 0;
-  trb_scatter_keys(keys + first, count, shift, histograms + (size_t)TRB_GROUP_ID * TRB_DIGITS, sorted);
+  trb_scatter_keys(keys + first, count, shift, TRB_DIGITS, histograms + (size_t)TRB_GROUP_ID * TRB_DIGITS, sorted);
 }
 #else
 /* A work-group takes tiles of TRB_TILE keys, digits of eight bits. It counts with local atomics, whose order does not

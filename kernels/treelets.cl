@@ -1,21 +1,23 @@
-/* Treelet restructuring (trbvh.h, >>treelets): one round, in which every node of gamma references or more is the root of
- * a treelet once, after those below it. */
+/* Treelet restructuring (trbvh.h, >>treelets): every node of gamma references or more is the root of a treelet once a
+ * round, after those below it; first the top of the tree, then what is below. */
 #include "shape.cl"
 
 #ifdef TRB_CPU
-TRB_KERNEL trb_k_find_groups(__global trb_plan *plan, const __global trbvh_node *nodes, __global uint *top,
-                             __global uint *lists, __global trb_group *groups, uint gamma) {
-  plan->groups = plan->ref_count ? trb_find_groups(nodes, top, lists, groups, gamma) : 0;
+TRB_KERNEL trb_k_restructure_top(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
+                                 __global ulong *sorted, uint rounds) {
+  if (plan->ref_count) trb_restructure_top(nodes, trb_split_words(keys, sorted, plan->ref_count), rounds, plan->costs);
 }
 
-TRB_KERNEL trb_k_restructure(const __global trb_plan *plan, __global trbvh_node *nodes, __global uint *lists,
-                             const __global trb_group *groups, uint gamma) {
+/* And settles them, while they are in the caches. */
+TRB_KERNEL trb_k_restructure_groups(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
+                                    __global ulong *sorted, __global trb_task *tasks, const __global trb_group *groups,
+                                    uint rounds) {
+  const trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);
   uint i;
-  TRB_FOR_JOBS(i, plan->groups) trb_restructure_group(nodes, lists, groups[i], gamma, plan->costs);
-}
-
-TRB_KERNEL trb_k_restructure_top(const __global trb_plan *plan, __global trbvh_node *nodes, __global uint *lists, uint gamma) {
-  if (plan->ref_count) trb_restructure_top(nodes, lists, plan->ref_count, gamma, plan->costs);
+  TRB_FOR_JOBS(i, plan->groups) {
+    trb_restructure_group(&c, tasks, groups[i], rounds);
+    trb_settle_group(&c, tasks, groups[i]);
+  }
 }
 #else
 /* Nodes of one depth are independent: the roots are listed level by level from the top down, and restructured from the
@@ -63,14 +65,17 @@ TRB_KERNEL trb_k_list_levels(const __global trbvh_node *nodes, __global trb_leve
   }
 }
 
-static void trb_restructure_lane(__global trbvh_node *nodes, __local trb_treelets *t, uint root, trb_costs costs) {
+/* Not those of more than `largest` references. */
+static void trb_restructure_lane(__global trbvh_node *nodes, __local trb_treelets *t, uint root, uint largest, trb_costs costs) {
   const uint lane = TRB_LOCAL_ID;
+  float sums[TRB_SUBSETS];
   uint i;
-  trb_expand(nodes, t, lane, 0, 0, root);
+  if (trb_count(nodes[root].count) > largest) return;
+  trb_start_treelet(nodes, t, lane, root);
   for (i = 1; i < TRB_TREELET - 1; i++) trb_expand_largest(nodes, t, lane, i);
   for (i = 0; i < TRB_TREELET; i++) trb_enter_leaf(nodes, t, lane, i);
-  trb_treelet_costs(t->leaves + lane, t->table + lane, costs);
-  trb_finish_treelet(nodes, t, lane, root, costs);
+  trb_treelet_costs_1(t->leaves + lane, t->table + lane, sums, costs);
+  trb_finish_treelet(nodes, t, sums, lane, root, costs);
 }
 
 #define TRB_TREELET_KERNEL __kernel __attribute__((reqd_work_group_size(TRB_LANES, 1, 1))) void
@@ -78,20 +83,20 @@ static void trb_restructure_lane(__global trbvh_node *nodes, __local trb_treelet
 /* Up to TRB_ROOTS_MAX of the level's roots, from number `begin` on. */
 TRB_TREELET_KERNEL trb_k_restructure_level(const __global trb_plan *plan, __global trbvh_node *nodes,
                                            const __global trb_level *levels, const __global uint *list,
-                                           __local trb_treelets *t, uint level, uint begin) {
+                                           __local trb_treelets *t, uint largest, uint level, uint begin) {
   const uint i = begin + (uint)get_global_id(0);
-  if (i < levels[level].count) trb_restructure_lane(nodes, t, list[levels[level].first + i], plan->costs);
+  if (i < levels[level].count) trb_restructure_lane(nodes, t, list[levels[level].first + i], largest, plan->costs);
 }
 
 /* One work-group: all levels from the lowest one up to this. */
 TRB_TREELET_KERNEL trb_k_restructure_levels(const __global trb_plan *plan, __global trbvh_node *nodes,
                                             const __global trb_level *levels, const __global uint *list,
-                                            __local trb_treelets *t, uint level) {
+                                            __local trb_treelets *t, uint largest, uint level) {
   uint lowest = level, i;
   while (lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;
   for (lowest++; lowest-- > level;) {
     for (i = TRB_LOCAL_ID; i < levels[lowest].count; i += TRB_LANES)
-      trb_restructure_lane(nodes, t, list[levels[lowest].first + i], plan->costs);
+      trb_restructure_lane(nodes, t, list[levels[lowest].first + i], largest, plan->costs);
     TRB_SYNC();
   }
 }

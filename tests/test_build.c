@@ -628,6 +628,60 @@ static void test_bytes_bound(void)
   CHECK(trbvh_bytes_bound(&g, &o, &scratch) == 0 && scratch == 0);
 }
 
+/* What bytes_bound promises is enough, and not much more than enough; what a build takes is little. */
+static void test_memory(void)
+{
+  static const struct { const char *name; void (*make)(scene *s, uint32_t n); uint32_t full, tree; } meshes[] = {
+    {"random", make_random, 100000, 40}, {"sphere", make_sphere, 120000, 41}, {"rock", make_rock, 110000, 40},
+    {"room", make_room, 130000, 40}, {"terrain", make_terrain, 200000, 40}, {"slivers", make_slivers, 100000, 40},
+    {"city", make_city, 120000, 40}, {"clusters", make_clusters, 100000, 40},
+    {"not_finite", make_not_finite, 100000, 40}, {"duplicates", make_duplicates, 100000, 40},
+    {"small", make_random, 900, 68},
+    {"huge_and_tiny", make_huge_and_tiny, 100000, 68}               /* a leaf each pays there */
+  };
+  unsigned at, flags;
+  int preset;
+  for (at = 0; at < sizeof meshes / sizeof meshes[0]; ++at) {
+    scene s;
+    trbvh_geometry g;
+    memset(&s, 0, sizeof s);
+    meshes[at].make(&s, QUICK_OR(meshes[at].full / 6, meshes[at].full));
+    g = scene_geometry(&s);
+    for (preset = -1; preset < PRESET_COUNT; ++preset)               /* -1: default options */
+      for (flags = 0; flags <= TRBVH_NO_TRIANGLES; flags += TRBVH_NO_TRIANGLES) {
+        trbvh_options o = preset_options(preset < 0 ? 0 : preset);
+        trbvh bvh;
+        trbvh_stats stats;
+        counter c;
+        size_t scratch = 0, bound, used;
+        if (preset < 0) memset(&o, 0, sizeof o);
+        o.flags = flags;
+        CONTEXT("%s, %u triangles, preset %s, flags %u", meshes[at].name, s.count,
+            preset < 0 ? "none" : preset_names[preset], flags);
+        bound = trbvh_bytes_bound(&g, &o, &scratch);
+        CHECK(build_counted(&bvh, &g, &o, &c, &stats) == TRBVH_OK);
+        CHECK_MSG(c.allocs == 2 && c.sizes[0] <= scratch && c.sizes[1] <= bound,
+            "%u allocations, %zu and %zu, bounds %zu and %zu", c.allocs, c.sizes[0], c.sizes[1], scratch, bound);
+        CHECK_MSG(c.sizes[0] == stats.bytes_scratch && c.sizes[1] == stats.bytes_result,
+            "%zu and %zu, stats %zu and %zu", c.sizes[0], c.sizes[1], stats.bytes_scratch, stats.bytes_result);
+        used = stats.bytes_result + stats.bytes_scratch;
+        CHECK_MSG(c.peak_bytes <= bound + scratch && c.peak_bytes <= used, "peak %zu, bounds %zu and %zu, stats %zu",
+            c.peak_bytes, bound, scratch, used);
+        if (preset < 0 && !flags)
+          CHECK_MSG((double)(bound + scratch) <= 1.5 * (double)used, "bounds %zu and %zu, %zu used", bound, scratch,
+              used);
+        if (abs(preset) == 1 && flags && s.count > 99000) {          /* MEDIUM; no splits, no triangles */
+          const double all = (double)c.peak_bytes / s.count, tree = (double)stats.bytes_result / s.count;
+          CHECK_MSG(all <= 80 + meshes[at].tree + (meshes[at].tree > 40), "%.1f bytes a triangle", all);
+          CHECK_MSG(tree <= meshes[at].tree, "a tree of %.1f bytes a triangle", tree);
+          CHECK_MSG((double)stats.bytes_scratch <= 82.0 * s.count, "%zu bytes of scratch memory", stats.bytes_scratch);
+        }
+        check_freed(&bvh, &c);
+      }
+    scene_free(&s);
+  }
+}
+
 // >>damage ----------------------------------------------------------------------------------------------------------
 typedef struct tree_copy { trbvh bvh; trbvh_node *nodes; uint32_t *prims; trbvh_triangle *triangles; void *memory; } tree_copy;
 
@@ -842,6 +896,7 @@ int main(int argc, char **argv)
   RUN(test_rebuild);
   RUN(test_empty);
   RUN(test_bytes_bound);
+  RUN(test_memory);
   RUN(test_validate_sees_damage);
   RUN(test_validate_sees_depth);
   RUN(test_version_and_texts);

@@ -414,6 +414,246 @@ static void test_cancel_with_jobs(void)
   scene_free(&s);
 }
 
+// >>scratch memory of the user's -------------------------------------------------------------------------------------
+/* Memory of a size, `offset` bytes past a cache line, between guards; all of it filled. */
+enum { GUARD = 256 };
+typedef struct arena { unsigned char *memory, *start; size_t size; } arena;
+
+static void arena_start(arena *a, size_t size, unsigned offset, int fill)
+{
+  a->memory = (unsigned char *)xmalloc(size + 2 * GUARD + 64 + offset);
+  a->start = a->memory + GUARD;
+  a->start += (64 - (uintptr_t)a->start % 64) % 64 + offset;
+  a->size = size;
+  memset(a->start - GUARD, 0x5A, size + 2 * GUARD);
+  memset(a->start, fill, size);
+}
+static void arena_check(const arena *a)
+{
+  unsigned i, before = 0, after = 0;
+  for (i = 0; i < GUARD; ++i) {
+    before += a->start[(int)i - GUARD] != 0x5A;
+    after += a->start[a->size + i] != 0x5A;
+  }
+  CHECK_MSG(!before && !after, "%u bytes written before the scratch memory, %u after", before, after);
+}
+
+static void test_scratch_of_the_user(void)
+{
+  static const unsigned offsets[] = {0, 1, 4, 8, 31, 63};
+  unsigned at, i;
+  int preset;
+  for (at = 0; at < HOOK_LARGE; ++at)
+    for (preset = 0; preset < PRESET_COUNT; ++preset) {
+      scene s;
+      trbvh_geometry g;
+      trbvh_options o = preset_options(preset);
+      trbvh want, bvh;
+      trbvh_stats stats;
+      counter c;
+      size_t scratch = 0;
+      hook_scene(&s, at, at < HOOK_SCENES ? 3000 : QUICK_OR(20000, 40000));
+      g = scene_geometry(&s);
+      memset(&want, 0, sizeof want);
+      memset(&bvh, 0, sizeof bvh);
+      memset(&c, 0, sizeof c);
+      CONTEXT("scene %s, preset %s", s.name, preset_names[preset]);
+      CHECK(trbvh_build(&want, &g, &o) == TRBVH_OK);
+      trbvh_bytes_bound(&g, &o, &scratch);
+      o.allocator = counter_allocator(&c);
+      o.stats = &stats;
+      for (i = 0; i < sizeof offsets / sizeof offsets[0]; ++i) {
+        arena a;
+        void *block;
+        if (at >= HOOK_SCENES && i % 3 != 1) continue;
+        CONTEXT("scene %s, preset %s, scratch memory %u bytes past a line", s.name, preset_names[preset], offsets[i]);
+        arena_start(&a, scratch, offsets[i], i % 2 ? 0xAA : 0xFF);
+        o.scratch = a.start;
+        o.scratch_size = scratch;
+        o.jobs.width = i % 3 + 1;
+        c.calls = c.allocs = 0;
+        c.peak_bytes = c.live_bytes;
+        CHECK(trbvh_build(&bvh, &g, &o) == TRBVH_OK && same_tree(&bvh, &want));
+        CHECK_MSG(c.calls == (bvh.block != NULL), "%u allocations", c.calls);
+        CHECK_MSG(c.peak_bytes == bvh.block_size, "%zu bytes allocated, block_size %zu", c.peak_bytes, bvh.block_size);
+        CHECK_MSG(stats.bytes_scratch <= scratch && !stats.bytes_scratch == !scratch, "scratch %zu, bound %zu",
+            stats.bytes_scratch, scratch);
+        arena_check(&a);
+        block = bvh.block;                             /* again, with what the first build left there */
+        CHECK(trbvh_build(&bvh, &g, &o) == TRBVH_OK && same_tree(&bvh, &want));
+        CHECK_MSG(c.calls == (bvh.block != NULL) && bvh.block == block, "%u allocations for two builds", c.calls);
+        arena_check(&a);
+        if (scratch) {
+          o.scratch_size = scratch - 1;                /* over a tree */
+          CHECK(trbvh_build(&bvh, &g, &o) == TRBVH_INVALID_ARGUMENT && tree_is_empty(&bvh));
+          CHECK(memchr(stats.message, 0, sizeof stats.message) && strstr(stats.message, "scratch"));
+          CHECK_MSG(c.live == 0 && c.bad_frees == 0, "%u live, %u bad frees", c.live, c.bad_frees);
+          c.calls = 0;                                 /* into {0}, and with no memory at all */
+          CHECK(trbvh_build(&bvh, &g, &o) == TRBVH_INVALID_ARGUMENT && tree_is_empty(&bvh) && c.calls == 0);
+          o.scratch_size = 0;
+          CHECK(trbvh_build(&bvh, &g, &o) == TRBVH_INVALID_ARGUMENT && tree_is_empty(&bvh) && c.calls == 0);
+          arena_check(&a);
+        }
+        o.scratch = NULL;                              /* no pointer: allocated, whatever the size says */
+        CHECK(trbvh_build(&bvh, &g, &o) == TRBVH_OK && same_tree(&bvh, &want));
+        trbvh_free(&bvh);
+        free(a.memory);
+        CHECK_MSG(c.live == 0 && c.bad_frees == 0, "%u live, %u bad frees", c.live, c.bad_frees);
+      }
+      trbvh_free(&want);
+      scene_free(&s);
+    }
+}
+
+/* Builds that fail leave it alone: it is the user's to free. */
+static void test_scratch_and_failures(void)
+{
+  scene s;
+  trbvh_geometry g;
+  trbvh_options o = preset_options(2);
+  trbvh bvh;
+  counter c;
+  ticks t;
+  arena a;
+  unsigned n;
+  size_t scratch = 0;
+  memset(&bvh, 0, sizeof bvh);
+  memset(&c, 0, sizeof c);
+  hook_scene(&s, 2, 3000);
+  g = scene_geometry(&s);
+  o.allocator = counter_allocator(&c);
+  trbvh_bytes_bound(&g, &o, &scratch);
+  arena_start(&a, scratch, 16, 0xAA);
+  o.scratch = a.start;
+  o.scratch_size = scratch;
+  CONTEXT("no memory for the tree");
+  c.fail_at = 1;
+  CHECK(trbvh_build(&bvh, &g, &o) == TRBVH_OUT_OF_MEMORY && tree_is_empty(&bvh) && c.live == 0 && c.bad_frees == 0);
+  c.fail_at = 0;
+  o.progress = on_tick;
+  o.progress_user = &t;
+  for (n = 1; n < 1000; ++n) {
+    trbvh_result result;
+    CONTEXT("cancelled at tick %u", n);
+    ticks_start(&t, n);
+    result = trbvh_build(&bvh, &g, &o);
+    CHECK(result == (t.count >= n ? TRBVH_CANCELLED : TRBVH_OK));
+    if (result == TRBVH_OK) break;
+    CHECK(tree_is_empty(&bvh) && c.live == 0 && c.bad_frees == 0);
+    arena_check(&a);
+  }
+  CHECK(n > 5 && n < 1000);
+  trbvh_free(&bvh);
+  CHECK(c.live == 0 && c.bad_frees == 0);
+  free(a.memory);
+  scene_free(&s);
+}
+
+/* A mesh of many groups: most of it in a room, copies of one place, some far away, every fifth not finite. */
+static void make_mixed(scene *s, uint32_t n)
+{
+  uint32_t i, k;
+  make_random(s, n);
+  for (i = 0; i < n; ++i) {
+    float *p = s->positions + 9 * i, bad = bad_float(i);
+    if (i % 1000 == 500) for (k = 0; k < 9; ++k) p[k] *= 300.0f;
+    if (i % 11 == 3 && i > 40) memcpy(p, s->positions + 9 * (i % 40), 9 * sizeof(float));
+    if (i % 5 == 2 || i / 16384 == 3) memcpy(p + i % 9, &bad, sizeof bad);
+  }
+}
+
+static void test_jobs_on_many_groups(void)
+{
+  static const uint32_t some[] = {1, 2, 3, 8, 16};
+  scene s;
+  trbvh_geometry g;
+  unsigned system, w;
+  int preset;
+  memset(&s, 0, sizeof s);
+  make_mixed(&s, QUICK_OR(90000, 150000));
+  g = scene_geometry(&s);
+  for (preset = 0; preset < PRESET_COUNT - 1; ++preset) {
+    trbvh_options o = preset_options(preset);
+    trbvh want;
+    walk_info info;
+    char why[128] = "";
+    unsigned group_jobs = 0;
+    memset(&want, 0, sizeof want);
+    CONTEXT("preset %s", preset_names[preset]);
+    CHECK(trbvh_build(&want, &g, &o) == TRBVH_OK);
+    CHECK_MSG(walk_tree(&want, &g, 8, preset >= 2, &info, why, sizeof why) && info.skipped > s.count / 5, "%s", why);
+    for (system = 0; system < SYSTEM_COUNT; ++system)
+      for (w = 0; w < sizeof some / sizeof some[0]; ++w) {
+        trbvh bvh;
+        job_log log;
+        memset(&bvh, 0, sizeof bvh);
+        memset(&log, 0, sizeof log);
+        if (system > 2 && w % 2 == 0) continue;
+        o.jobs.parallel_for = systems[system].run;
+        o.jobs.user = &log;
+        o.jobs.width = some[w];
+        CONTEXT("preset %s, %s, width %u", preset_names[preset], systems[system].name, some[w]);
+        CHECK(trbvh_build(&bvh, &g, &o) == TRBVH_OK);
+        CHECK_MSG(same_tree(&bvh, &want), "another tree than without jobs");
+        if (log.most > group_jobs) group_jobs = log.most;
+        trbvh_free(&bvh);
+      }
+    CHECK_MSG(group_jobs > 5, "%u jobs at once at most", group_jobs);
+    trbvh_free(&want);
+  }
+  scene_free(&s);
+}
+
+/* One triangle a million times the scene's size away: one child of the root is the rest, too large for one job; the
+ * other is a job of a single reference. */
+static void test_single_outlier(void)
+{
+  static const uint32_t places[] = {0, 24999, 49999};
+  unsigned p, far, w, system, lonely;
+  int preset;
+  for (p = 0; p < 3; ++p)
+    for (far = 0; far < 2; ++far) {
+      scene s;
+      trbvh_geometry g;
+      uint32_t k;
+      memset(&s, 0, sizeof s);
+      make_random(&s, 50000);
+      for (k = 0; k < 9; ++k) s.positions[9 * places[p] + k] += far ? 2e6f : -2e6f;
+      g = scene_geometry(&s);
+      for (preset = 0; preset < PRESET_COUNT; ++preset) {
+        trbvh_options o = preset_options(preset);
+        trbvh want;
+        walk_info info;
+        char why[128] = "";
+        memset(&want, 0, sizeof want);
+        CONTEXT("outlier %u, far %u, preset %s", places[p], far, preset_names[preset]);
+        CHECK(trbvh_build(&want, &g, &o) == TRBVH_OK);
+        if (!QUICK_OR(p, 0)) CHECK_MSG(walk_tree(&want, &g, 8, preset >= 2, &info, why, sizeof why), "%s", why);
+        for (lonely = 0, k = 0; want.nodes && k < 2; ++k) {
+          const trbvh_node *child = &want.nodes[want.nodes[0].first + k];
+          lonely += child->count == 1 && want.prims[child->first] == places[p];
+        }
+        CHECK_MSG(lonely == 1, "the outlier is no child of the root");
+        for (system = 0; system < 3; ++system)
+          for (w = 2; w <= 4; w += 2) {
+            trbvh bvh;
+            job_log log;
+            memset(&bvh, 0, sizeof bvh);
+            memset(&log, 0, sizeof log);
+            o.jobs.parallel_for = systems[system].run;
+            o.jobs.user = &log;
+            o.jobs.width = w;
+            CONTEXT("outlier %u, far %u, preset %s, %s, width %u", places[p], far, preset_names[preset],
+                systems[system].name, w);
+            CHECK(trbvh_build(&bvh, &g, &o) == TRBVH_OK && same_tree(&bvh, &want));
+            trbvh_free(&bvh);
+          }
+        trbvh_free(&want);
+      }
+      scene_free(&s);
+    }
+}
+
 static void test_queries_on_jobs(void)
 {
   static const uint32_t counts[] = {0, 1, 2, 63, 64, 65, 1000, 5003};
@@ -482,6 +722,10 @@ int main(int argc, char **argv)
   RUN(test_cancel_at_every_tick);
   RUN(test_jobs_do_not_change_the_tree);
   RUN(test_cancel_with_jobs);
+  RUN(test_scratch_of_the_user);
+  RUN(test_scratch_and_failures);
+  RUN(test_jobs_on_many_groups);
+  RUN(test_single_outlier);
   RUN(test_queries_on_jobs);
   return test_finish();
 }

@@ -1,0 +1,848 @@
+/* bench.c - how fast each preset builds and how good its trees are; beside Embree's builders, where it is linked.
+ * Introduces: building again into the same tree, times and bytes by stage, many small trees on threads of your own.
+ *
+ *   cc -O2 examples/bench.c -o bench -lm -pthread && ./bench meshes/
+ *   cc -O2 -DBENCH_EMBREE=3 examples/bench.c -o bench -lembree3 -lm -pthread     (or 4, and -lembree4)
+ *
+ * Every repetition runs each builder once, so that noise hits all alike, and medians are printed. A build is timed as
+ * an engine does it again for a mesh that has changed: into the same tree; "fresh" is into an empty one. Needs POSIX,
+ * or MinGW.
+ */
+#define _DEFAULT_SOURCE                /* with -std=c99 too: large pages for the library */
+#define TRBVH_THREADS
+#define TRBVH_IMPLEMENTATION
+#include "../trbvh.h"
+#define EX_PROGRAM "bench"
+#include "common.h"
+#include <dirent.h>
+#include <pthread.h>
+#include <unistd.h>
+#ifdef BENCH_EMBREE                    /* its major version */
+  #if BENCH_EMBREE >= 4
+    #include <embree4/rtcore.h>
+  #else
+    #include <embree3/rtcore.h>
+  #endif
+#endif
+
+static const char usage[] =
+  "usage: bench [MESH or FOLDER]... [options]\n"
+  "  MESH           an OBJ, PLY or STL file; a FOLDER stands for all in it; without any, four built-in scenes\n"
+  "  --threads N    after 1, instead of one for each processor\n"
+  "  --reps N       repetitions, whose median counts; 9\n"
+  "  --csv FILE     write every row there, with all columns\n"
+  "  --quick        3 repetitions, and a tenth of the triangles in what is built in\n"
+  "  --adversarial  inputs that may be slow to build, instead of meshes\n"
+  "  --small        meshes of 12 to 1000 triangles, and a batch of many, instead of meshes\n";
+
+// >>rows ----------------------------------------------------------------------------------------------------
+/* trbvh's presets, BEST being the same as HIGH in this version; then Embree's. Those of one level are compared. */
+typedef struct builder { const char *name; int level, quality; uint32_t min_leaf, max_leaf; } builder;
+static const builder builders[] = {
+  {"trbvh FAST", 0, TRBVH_QUALITY_FAST, 0, 0},
+  {"trbvh MEDIUM", 1, TRBVH_QUALITY_MEDIUM, 0, 0},
+  {"trbvh HIGH", 2, TRBVH_QUALITY_HIGH, 0, 0},
+#ifdef BENCH_EMBREE
+  {"Embree LOW", 0, RTC_BUILD_QUALITY_LOW, 4, 4},
+  {"Embree MEDIUM", 1, RTC_BUILD_QUALITY_MEDIUM, 1, 8},
+  {"Embree HIGH", 2, RTC_BUILD_QUALITY_HIGH, 1, 8},
+#endif
+};
+enum { PRESETS = 3, BUILDERS = sizeof builders / sizeof *builders, REPS_MAX = 99 };
+
+/* Columns of a row: times are ms, sizes bytes per triangle. "other" is outside of all stages: starting threads, say. */
+enum { RATE, MS, FRESH, STAGE, OTHER = STAGE + 7, SAH, RESULT, SCRATCH, RATIO, SAH_RATIO, COLUMNS };
+static const char *const titles[COLUMNS] = {
+  "Mtri/s", "ms", "fresh", "split", "morton", "sort", "hierarchy", "treelets", "collapse", "finish", "other", "SAH",
+  "result", "scratch", "/ Embree", "SAH / Embree"
+};
+static const char csv_header[] =
+  "mesh,triangles,threads,builder,mtri_per_s,ms,fresh_ms,split_ms,morton_ms,sort_ms,hierarchy_ms,treelets_ms,"
+  "collapse_ms,finish_ms,other_ms,sah,result_bytes_per_triangle,scratch_bytes_per_triangle,rate_to_embree,"
+  "sah_to_embree,ns_per_triangle,fresh_ns,split_ns,morton_ns,sort_ns,hierarchy_ns,treelets_ns,collapse_ns,finish_ns,"
+  "other_ns\n";
+
+typedef struct row {
+  char mesh[40];
+  double triangles;
+  uint32_t threads;
+  const builder *builder;
+  double values[COLUMNS];              /* below 0: not known */
+} row;
+typedef struct input { const char *name; int scene; double size; } input;   /* a file, scene -1, and its bytes */
+typedef struct bench {
+  const char *csv_path;
+  FILE *csv;
+  int reps, quick, adversarial, small;
+  uint32_t threads[2];                 /* to measure with; the second is --threads */
+  int turns;                           /* how many of these */
+  input *inputs;
+  size_t input_count;
+  row *rows;                           /* for each input, of these for each number of threads, of these the builders */
+  double start, shown, done, total;    /* progress: ms, and sizes of inputs */
+} bench;
+
+static double ns_per_triangle(const row *r, int column)
+{
+  return r->values[column] < 0 ? -1 : r->values[column] * 1e6 / r->triangles;
+}
+static row new_row(const char *mesh, double triangles, uint32_t threads, const builder *of, double ms)
+{
+  row r = {"", triangles, threads, of, {0}};
+  snprintf(r.mesh, sizeof r.mesh, "%s", mesh);
+  for (int i = 0; i < COLUMNS; i++) r.values[i] = -1;
+  r.values[MS] = ms;
+  r.values[RATE] = triangles / ms / 1e3;
+  return r;
+}
+static void write_csv(const bench *b, const row *r)
+{
+  if (!b->csv) return;
+  fprintf(b->csv, "\"%s\",%.0f,%u,%s", r->mesh, r->triangles, r->threads, r->builder->name);
+  for (int i = 0; i < COLUMNS + SAH - MS; i++) {
+    double value = i < COLUMNS ? r->values[i] : ns_per_triangle(r, i - COLUMNS + MS);
+    if (value < 0) fputs(",", b->csv);
+    else fprintf(b->csv, ",%.6g", value);
+  }
+  fputs("\n", b->csv);
+  fflush(b->csv);
+}
+
+// >>progress ------------------------------------------------------------------------------------------------
+/* On a terminal a line that changes, else one for each input. part: of what is running, 0..1; more: inputs left */
+static void show_progress(bench *b, const char *what, double size, double part, size_t more)
+{
+  double now = ex_now_ms(), done = (b->done + size * part) / b->total;
+  int terminal = isatty(2);
+  char left[32] = "";
+  if (part > 0 && (!terminal || now - b->shown < 200)) return;
+  b->shown = now;
+  if (done > 0) {
+    double seconds = (now - b->start) * (1 - done) / done / 1e3;
+    int minutes = seconds > 100;
+    snprintf(left, sizeof left, ", about %.0f %s left", minutes ? seconds / 60 : seconds, minutes ? "min" : "s");
+  }
+  fprintf(stderr, terminal ? "\r%.40s, %u more%s      " : "%s, %u more%s\n", what, (unsigned)more, left);
+}
+static void clear_progress(void) { if (isatty(2)) fprintf(stderr, "\r%79s\r", ""); }
+
+// >>inputs --------------------------------------------------------------------------------------------------
+enum { TERRAIN, CITY, SOUP, SLIVERS, IDENTICAL, SORTED, REVERSED, TWO_CENTERS, OUTLIER, GEOMETRIC };
+static const input scenes[] = {{"terrain", TERRAIN, 1}, {"city", CITY, 1}, {"soup", SOUP, 1}, {"slivers", SLIVERS, 1}};
+static const input adversaries[] = {   /* the first is what the others are compared with */
+  {"small random triangles", SOUP, 1}, {"all identical", IDENTICAL, 1}, {"sorted along x", SORTED, 1},
+  {"reversed along x", REVERSED, 1}, {"flat with two centres", TWO_CENTERS, 1}, {"one of them 1e6 away", OUTLIER, 1},
+  {"long slivers", SLIVERS, 1}, {"scaled by 2^-(i mod 120)", GEOMETRIC, 1}
+};
+
+static ex_vec random_point(uint32_t *seed, float low, float high)
+{
+  float x = ex_random_in(seed, low, high), y = ex_random_in(seed, low, high), z = ex_random_in(seed, low, high);
+  return ex_v(x, y, z);
+}
+static ex_vec terrain_point(const void *nothing, float u, float v)
+{
+  (void)nothing;
+  return ex_v(100 * u, 8 * ex_fractal_noise(ex_v(7 * u, 0.5f, 7 * v)), 100 * v);
+}
+/* Towers along straight streets, with four balconies each. */
+static void add_city(ex_builder *b, uint32_t count)
+{
+  uint32_t seed = 2, side = (uint32_t)sqrt(count / 60.0);
+  for (uint32_t i = 0; i < side * side; i++) {
+    float x = (float)(i % side), z = (float)(i / side), half = 0.2f / (0.05f + ex_random(&seed));
+    ex_add_box(b, ex_v(x, half, z), ex_v(0.35f, 0, 0), ex_v(0, half, 0), ex_v(0, 0, 0.35f));
+    for (int k = 1; k < 5; k++) {
+      ex_vec middle = ex_v(x + 0.4f, 0.4f * half * (float)k, z);
+      ex_add_box(b, middle, ex_v(0.05f, 0, 0), ex_v(0, 0.02f, 0), ex_v(0, 0, 0.2f));
+    }
+  }
+}
+/* Triangle i of n that share no corner. */
+static void make_triangle(int kind, uint32_t i, uint32_t n, uint32_t *seed, ex_vec p[3])
+{
+  ex_vec center = random_point(seed, 0, 1);
+  float size = 0.5f / cbrtf((float)n), scale = kind == GEOMETRIC ? ldexpf(1, -(int)(i % 120)) : 1;
+  if (kind == SORTED) center.x = (float)i / (float)n;
+  if (kind == REVERSED) center.x = (float)(n - i) / (float)n;
+  if (kind == OUTLIER && i == n - 1) center = ex_v(1e6f, 1e6f, 1e6f);
+  for (int k = 0; k < 3; k++) p[k] = ex_scale(ex_add(center, random_point(seed, -size, size)), scale);
+  if (kind == SLIVERS) {
+    p[1] = ex_add(p[0], random_point(seed, -0.4f, 0.4f));
+    p[2] = ex_add(p[1], random_point(seed, -0.001f, 0.001f));
+  }
+  if (kind == IDENTICAL || kind == TWO_CENTERS) {   /* of the boxes; they are exact, as these sums are */
+    float x = kind == IDENTICAL ? 0 : (float)(i & 1), s = kind == IDENTICAL ? 1 : ex_random(seed) / 4;
+    p[0] = ex_v(x - s, 0, -s);
+    p[1] = ex_v(x + s, 0, -s);
+    p[2] = ex_v(x, 0, s);
+  }
+}
+static void make_scene(ex_builder *b, int kind, uint32_t count)
+{
+  unsigned side = (unsigned)sqrt(count / 2.0);
+  uint32_t seed = 1;
+  ex_vec p[3];
+  if (kind == TERRAIN) ex_add_surface(b, terrain_point, NULL, side, side, 0);
+  if (kind == CITY) add_city(b, count);
+  for (uint32_t i = 0; i < count && kind >= SOUP; i++) {
+    make_triangle(kind, i, count, &seed, p);
+    for (int k = 0; k < 3; k++) ex_add_vertex(b, p[k]);
+    ex_add_triangle(b, 3 * i, 3 * i + 1, 3 * i + 2);
+  }
+}
+
+static void add_input(bench *b, input one)
+{
+  if ((b->input_count & (b->input_count - 1)) == 0) {   /* there is room for the next power of two */
+    b->inputs = (input *)realloc(b->inputs, (2 * b->input_count + 1) * sizeof *b->inputs);
+    if (!b->inputs) ex_die("not enough memory");
+  }
+  b->inputs[b->input_count++] = one;
+}
+static void add_file(bench *b, const char *path)
+{
+  input one = {path, -1, 0};
+  FILE *file = fopen(path, "rb");
+  if (!file) ex_die("%s: cannot be opened", path);
+  if (fseek(file, 0, SEEK_END) == 0) one.size = (double)ftell(file);
+  fclose(file);
+  add_input(b, one);
+}
+static int by_name(const void *a, const void *b) { return strcmp(((const input *)a)->name, ((const input *)b)->name); }
+static void add_path(bench *b, const char *path)
+{
+  size_t first = b->input_count;
+  DIR *folder = opendir(path);
+  if (!folder) {
+    add_file(b, path);
+    return;
+  }
+  for (struct dirent *entry; (entry = readdir(folder)) != NULL;) {
+    const char *dot = strrchr(entry->d_name, '.');
+    if (!dot || strlen(dot) != 4 || !strstr(".obj.ply.stl.OBJ.PLY.STL", dot)) continue;
+    size_t size = strlen(path) + strlen(entry->d_name) + 2;
+    char *name = (char *)ex_allocate(size, 1);   /* until the end */
+    snprintf(name, size, "%s/%s", path, entry->d_name);
+    add_file(b, name);
+  }
+  closedir(folder);
+  if (b->input_count == first) ex_die("%s: no OBJ, PLY or STL file in it", path);
+  qsort(b->inputs + first, b->input_count - first, sizeof *b->inputs, by_name);
+}
+static ex_mesh load(const bench *b, const input *in)
+{
+  ex_builder built;
+  ex_vec low, high;
+  char error[512];
+  memset(&built, 0, sizeof built);
+  if (in->scene >= 0) make_scene(&built, in->scene, b->quick ? 20000 : 200000);
+  else if (!ex_mesh_read(in->name, &built.mesh, error, sizeof error)) ex_die("%s", error);
+  if (built.failed) ex_die("not enough memory");
+  if (!ex_mesh_bounds(&built.mesh, &low, &high)) ex_die("%s: no vertex is finite", in->name);
+  return built.mesh;
+}
+
+// >>trbvh ---------------------------------------------------------------------------------------------------
+typedef struct run {                   /* of one builder */
+  trbvh tree;                          /* trbvh's */
+  trbvh_options options;
+  trbvh_stats stats;
+  void *root;                          /* Embree's */
+  double sah, result, scratch;         /* bytes */
+  double ms[SAH][REPS_MAX];            /* by column */
+} run;
+
+static trbvh_options options_of(int preset, uint32_t threads, trbvh_stats *stats)
+{
+  trbvh_options options = {.quality = (trbvh_quality)builders[preset].quality, .stats = stats};
+  options.jobs.width = threads;
+  return options;
+}
+/* As an engine that rebuilds: memory for the builds of this geometry, or smaller ones. */
+static void keep_scratch(trbvh_options *options, const trbvh_geometry *geometry)
+{
+  trbvh_bytes_bound(geometry, options, &options->scratch_size);
+  options->scratch = ex_allocate(options->scratch_size, 1);
+}
+static void build_trbvh(run *r, const trbvh_geometry *geometry, int preset, uint32_t threads, int rep)
+{
+  trbvh_options options = options_of(preset, threads, &r->stats);
+  trbvh fresh = {0};
+  double start = ex_now_ms();
+  ex_check(trbvh_build(&fresh, geometry, &options), "building", &r->stats);
+  r->ms[FRESH][rep] = ex_now_ms() - start;
+  trbvh_free(&fresh);
+
+  start = ex_now_ms();
+  ex_check(trbvh_build(&r->tree, geometry, &r->options), "building", &r->stats);
+  r->ms[MS][rep] = ex_now_ms() - start;
+  const trbvh_stats *s = &r->stats;
+  const double stages[OTHER - STAGE] = {s->ms_split, s->ms_morton, s->ms_sort, s->ms_hierarchy, s->ms_treelets,
+                                        s->ms_collapse, s->ms_finish};
+  double other = r->ms[MS][rep];
+  for (int i = STAGE; i < OTHER; i++) other -= r->ms[i][rep] = stages[i - STAGE];
+  r->ms[OTHER][rep] = other > 0 ? other : 0;
+  r->sah = s->sah_cost;
+  r->result = (double)s->bytes_result;
+  r->scratch = (double)s->bytes_scratch;
+}
+
+// >>Embree --------------------------------------------------------------------------------------------------
+#ifdef BENCH_EMBREE
+static const float cost_node = 1.2f, cost_prim = 1.0f;   /* trbvh's */
+
+/* As lean as nodes can be: 64 bytes. A child that is a leaf is its address plus 1. */
+typedef struct embree_node { ex_vec low[2], high[2]; void *children[2]; } embree_node;
+typedef struct embree_leaf { uint32_t count, prims[]; } embree_leaf;
+typedef struct embree {
+  RTCDevice device;
+  RTCBVH bvhs[BUILDERS];
+  const ex_mesh *mesh;
+  struct RTCBuildPrimitive *boxes, *work;   /* of the triangles; a copy, which builds reorder, with room for splits */
+  void *memory;                        /* where these are */
+  size_t count, room;                  /* of boxes and work */
+  pthread_mutex_t lock;                /* for these, which Embree has allocated: */
+  double bytes, most_bytes;
+} embree;
+
+static void *create_node(RTCThreadLocalAllocator allocator, unsigned count, void *user)
+{
+  (void)count, (void)user;
+  return rtcThreadLocalAlloc(allocator, sizeof(embree_node), 16);
+}
+static void set_children(void *node, void **children, unsigned count, void *user)
+{
+  (void)user;
+  memcpy(((embree_node *)node)->children, children, count * sizeof *children);
+}
+static void set_bounds(void *node, const struct RTCBounds **bounds, unsigned count, void *user)
+{
+  embree_node *n = (embree_node *)node;
+  (void)user;
+  for (unsigned i = 0; i < count; i++) {
+    n->low[i] = ex_load(&bounds[i]->lower_x);
+    n->high[i] = ex_load(&bounds[i]->upper_x);
+  }
+}
+static size_t leaf_size(size_t count) { return sizeof(embree_leaf) + count * sizeof(uint32_t); }
+static void *create_leaf(RTCThreadLocalAllocator allocator, const struct RTCBuildPrimitive *prims, size_t count,
+                         void *user)
+{
+  embree_leaf *leaf = (embree_leaf *)rtcThreadLocalAlloc(allocator, leaf_size(count), 4);
+  (void)user;
+  leaf->count = (uint32_t)count;
+  for (size_t i = 0; i < count; i++) leaf->prims[i] = prims[i].primID;
+  return (char *)leaf + 1;
+}
+
+typedef struct box { float low[3], high[3]; } box;
+static const box no_box = {{FLT_MAX, FLT_MAX, FLT_MAX}, {-FLT_MAX, -FLT_MAX, -FLT_MAX}};
+static void extend(box *a, const float p[3])
+{
+  for (int i = 0; i < 3; i++) {
+    if (p[i] < a->low[i]) a->low[i] = p[i];
+    if (p[i] > a->high[i]) a->high[i] = p[i];
+  }
+}
+/* The overlap of two boxes; Embree's are three floats, one of something else, three floats. */
+static void set_overlap(struct RTCBounds *out, const box *a, const struct RTCBuildPrimitive *prim)
+{
+  const float *low = &prim->lower_x, *high = &prim->upper_x;
+  float *out_low = &out->lower_x, *out_high = &out->upper_x;
+  for (int i = 0; i < 3; i++) {
+    out_low[i] = a->low[i] > low[i] ? a->low[i] : low[i];
+    out_high[i] = a->high[i] < high[i] ? a->high[i] : high[i];
+  }
+}
+/* As Embree splits triangles of its own: cuts the whole one exactly, and then keeps to the box that is left of it. */
+static void split_triangle(const struct RTCBuildPrimitive *prim, unsigned axis, float at, struct RTCBounds *left,
+                           struct RTCBounds *right, void *user)
+{
+  const ex_mesh *mesh = ((const embree *)user)->mesh;
+  const uint32_t *index = mesh->indices + 3 * (size_t)prim->primID;
+  box below = no_box, above = no_box;
+  for (int i = 0; i < 3; i++) {
+    const float *from = mesh->positions + 3 * (size_t)index[i], *to = mesh->positions + 3 * (size_t)index[(i + 1) % 3];
+    if (from[axis] <= at) extend(&below, from);
+    if (from[axis] >= at) extend(&above, from);
+    if ((from[axis] < at) == (to[axis] < at)) continue;
+    float cut[3], t = (at - from[axis]) / (to[axis] - from[axis]);
+    for (int k = 0; k < 3; k++) cut[k] = from[k] + t * (to[k] - from[k]);
+    cut[axis] = at;
+    extend(&below, cut);
+    extend(&above, cut);
+  }
+  set_overlap(left, &below, prim);
+  set_overlap(right, &above, prim);
+}
+
+static bool count_bytes(void *user, ssize_t bytes, bool post)
+{
+  embree *e = (embree *)user;
+  (void)post;
+  pthread_mutex_lock(&e->lock);
+  e->bytes += (double)bytes;
+  if (e->bytes > e->most_bytes) e->most_bytes = e->bytes;
+  pthread_mutex_unlock(&e->lock);
+  return true;
+}
+static void make_boxes(embree *e)      /* leaves out triangles that are not finite, as trbvh does */
+{
+  size_t triangles = e->mesh->triangle_count;
+  e->memory = ex_allocate(triangles + triangles * 13 / 10 + 1, sizeof *e->boxes);
+  e->boxes = (struct RTCBuildPrimitive *)(((uintptr_t)e->memory + 31) & ~(uintptr_t)31);   /* as Embree loads them */
+  for (size_t i = 0; i < triangles; i++) {
+    box bounds = no_box;
+    int finite = 1;
+    for (size_t k = 3 * i; k < 3 * i + 3; k++) {
+      ex_vec p;
+      finite &= ex_mesh_finite_corner(e->mesh, k, &p);
+      extend(&bounds, e->mesh->positions + 3 * (size_t)e->mesh->indices[k]);
+    }
+    memcpy(&e->boxes[e->count].lower_x, bounds.low, sizeof bounds.low);
+    memcpy(&e->boxes[e->count].upper_x, bounds.high, sizeof bounds.high);
+    e->boxes[e->count].primID = (unsigned)i;
+    e->count += (size_t)finite;
+  }
+  e->work = e->boxes + triangles;
+  e->room = e->count * 13 / 10;        /* as many splits as HIGH's */
+}
+static void start_embree(embree *e, const ex_mesh *mesh, uint32_t threads)
+{
+  char config[32];
+  memset(e, 0, sizeof *e);
+  pthread_mutex_init(&e->lock, NULL);
+  snprintf(config, sizeof config, "threads=%u", threads);
+  e->device = rtcNewDevice(config);
+  if (!e->device) ex_die("Embree: no device");
+  rtcSetDeviceMemoryMonitorFunction(e->device, count_bytes, e);
+  e->mesh = mesh;
+  make_boxes(e);
+  for (int i = PRESETS; i < BUILDERS; i++) e->bvhs[i] = rtcNewBVH(e->device);
+}
+static void end_embree(embree *e)      /* before the next device starts, which would get this one's threads */
+{
+  for (int i = PRESETS; i < BUILDERS; i++) rtcReleaseBVH(e->bvhs[i]);
+  rtcReleaseDevice(e->device);
+  pthread_mutex_destroy(&e->lock);
+  free(e->memory);
+}
+/* It fails where it finds no tree within the depth that trbvh promises; all its numbers are unknown then. */
+static void build_embree(embree *e, run *r, int number, int rep)
+{
+  const builder *of = builders + number;
+  struct RTCBuildArguments arguments = rtcDefaultBuildArguments();   /* two children, no blocks */
+  double bytes = e->most_bytes = e->bytes;
+  memcpy(e->work, e->boxes, e->count * sizeof *e->work);
+  arguments.buildQuality = (enum RTCBuildQuality)of->quality;
+  arguments.maxDepth = TRBVH_MAX_DEPTH;
+  arguments.minLeafSize = of->min_leaf;
+  arguments.maxLeafSize = of->max_leaf;
+  arguments.traversalCost = cost_node;
+  arguments.intersectionCost = cost_prim;
+  arguments.bvh = e->bvhs[number];
+  arguments.primitives = e->work;
+  arguments.primitiveCount = e->count;
+  arguments.primitiveArrayCapacity = of->quality == RTC_BUILD_QUALITY_HIGH ? e->room : e->count;
+  arguments.createNode = create_node;
+  arguments.setNodeChildren = set_children;
+  arguments.setNodeBounds = set_bounds;
+  arguments.createLeaf = create_leaf;
+  arguments.splitPrimitive = split_triangle;
+  arguments.userPtr = e;
+  double start = ex_now_ms();
+  r->root = rtcBuildBVH(&arguments);
+  r->ms[MS][rep] = r->root ? ex_now_ms() - start : -1;
+  if (e->most_bytes > bytes) {         /* in the first build; the array, too, is memory that it works in */
+    r->scratch = e->most_bytes - bytes + (double)(arguments.primitiveArrayCapacity * sizeof *e->work);
+  }
+}
+static double half_area(ex_vec low, ex_vec high)
+{
+  double x = (double)high.x - low.x, y = (double)high.y - low.y, z = (double)high.z - low.z;
+  return x * y + y * z + z * x;
+}
+/* Adds a subtree's part of the paper's equation 1, times the root's area, and its bytes. */
+static void add_subtree(const void *at, double area, double *cost, double *bytes)
+{
+  if ((uintptr_t)at & 1) {
+    const embree_leaf *leaf = (const embree_leaf *)(const void *)((const char *)at - 1);
+    *cost += cost_prim * area * leaf->count;
+    *bytes += (double)leaf_size(leaf->count);
+    return;
+  }
+  const embree_node *node = (const embree_node *)at;
+  *cost += cost_node * area;
+  *bytes += sizeof *node;
+  for (int i = 0; i < 2; i++) add_subtree(node->children[i], half_area(node->low[i], node->high[i]), cost, bytes);
+}
+static void judge_embree(const embree *e, run *r)
+{
+  ex_vec low, high;
+  ex_mesh_bounds(e->mesh, &low, &high);
+  double area = half_area(low, high);
+  if (r->root) add_subtree(r->root, area, &r->sah, &r->result);
+  r->sah = !r->root ? -1 : area > 0 ? r->sah / area : 0;
+  r->scratch = r->root ? r->scratch - r->result : -1;   /* the result is among what was allocated */
+}
+#endif
+
+// >>measuring -----------------------------------------------------------------------------------------------
+/* All builders with one mesh and one number of threads. */
+static void measure(bench *b, const input *in, const ex_mesh *mesh, int turn, size_t more, row rows[BUILDERS])
+{
+  trbvh_geometry geometry = ex_mesh_geometry(mesh);
+  run *runs = (run *)ex_allocate(BUILDERS, sizeof *runs);
+  uint32_t threads = b->threads[turn];
+  const char *slash = strrchr(in->name, '/'), *name = slash ? slash + 1 : in->name;
+  for (int i = 0; i < PRESETS; i++) {
+    runs[i].options = options_of(i, threads, &runs[i].stats);
+    keep_scratch(&runs[i].options, &geometry);
+  }
+#ifdef BENCH_EMBREE
+  embree e;
+  start_embree(&e, mesh, threads);
+#endif
+  for (int round = 0; round <= b->reps; round++) {   /* the first, which allocates, does not count */
+    int rep = round ? round - 1 : 0;
+    show_progress(b, name, in->size, (turn + round / (b->reps + 1.0)) / b->turns, more);
+    for (int i = 0; i < PRESETS; i++) build_trbvh(&runs[i], &geometry, i, threads, rep);
+#ifdef BENCH_EMBREE
+    for (int i = PRESETS; i < BUILDERS; i++) build_embree(&e, &runs[i], i, rep);
+#endif
+  }
+#ifdef BENCH_EMBREE
+  for (int i = PRESETS; i < BUILDERS; i++) judge_embree(&e, &runs[i]);
+  end_embree(&e);
+#endif
+  for (int i = 0; i < BUILDERS; i++) {
+    run *r = &runs[i];
+    rows[i] = new_row(name, mesh->triangle_count, threads, &builders[i], ex_median(r->ms[MS], b->reps));
+    double *values = rows[i].values;
+    for (int k = FRESH; k < SAH && i < PRESETS; k++) values[k] = ex_median(r->ms[k], b->reps);
+    values[SAH] = r->sah;
+    values[RESULT] = r->sah < 0 ? -1 : r->result / rows[i].triangles;
+    values[SCRATCH] = r->scratch / rows[i].triangles;
+    trbvh_free(&r->tree);
+    free(r->options.scratch);
+  }
+  for (int i = 0; i < PRESETS; i++) {
+    for (int k = PRESETS; k < BUILDERS; k++) {
+      if (builders[i].level != builders[k].level) continue;
+      rows[i].values[RATIO] = rows[i].values[RATE] / rows[k].values[RATE];
+      if (rows[k].values[SAH] > 0) rows[i].values[SAH_RATIO] = rows[i].values[SAH] / rows[k].values[SAH];
+    }
+  }
+  for (int i = 0; i < BUILDERS; i++) write_csv(b, &rows[i]);
+  free(runs);
+}
+
+// >>tables --------------------------------------------------------------------------------------------------
+static int width_of(int column)
+{
+  int width = (int)strlen(titles[column]) + 2;
+  return width > 8 ? width : 8;
+}
+static void print_titles(int from, int end) { for (; from < end; from++) printf("%*s", width_of(from), titles[from]); }
+static void print_number(int width, int decimals, double value)   /* blank where it is not known */
+{
+  if (value < 0) printf("%*s", width, "");
+  else printf("%*.*f", width, value < 1000 ? decimals : 0, value);
+}
+static void print_rows(const row rows[BUILDERS])
+{
+  int end = BUILDERS > PRESETS ? SAH_RATIO : RATIO;
+  printf("\n%s: %.0f triangles; threads: %u; times in ms, result and scratch memory in bytes/triangle\n%-15s",
+         rows->mesh, rows->triangles, rows->threads, "");
+  print_titles(0, end);
+  for (int i = 0; i < BUILDERS; i++) {
+    printf("\n  %-13s", builders[i].name);
+    for (int k = 0; k < end; k++) print_number(width_of(k), k == RESULT || k == SCRATCH ? 1 : 2, rows[i].values[k]);
+    if (i >= PRESETS) continue;
+    printf("\n%15s%*s", "ns/triangle", width_of(RATE), "");
+    for (int k = MS; k < SAH; k++) print_number(width_of(k), 1, ns_per_triangle(&rows[i], k));
+  }
+  puts("");
+  fflush(stdout);
+}
+
+static const row *row_of(const bench *b, size_t i, int turn, int number)
+{
+  return b->rows + (i * (size_t)b->turns + (size_t)turn) * BUILDERS + number;
+}
+static double geometric_mean(const bench *b, int turn, int number, int column)
+{
+  double sum = 0;
+  for (size_t i = 0; i < b->input_count; i++) {
+    double value = row_of(b, i, turn, number)->values[column];
+    if (!(value > 0)) return -1;
+    sum += log(value);
+  }
+  return exp(sum / (double)b->input_count);
+}
+static void print_means(const bench *b)
+{
+  static const int columns[] = {RATE, SAH, RATIO, SAH_RATIO};
+  int shown = BUILDERS > PRESETS ? 4 : 2;
+  printf("\n%-15s", "geometric means");
+  for (int turn = 0; turn < b->turns; turn++) {
+    printf("  |%4u thread%s", b->threads[turn], turn ? "s" : " ");
+    for (int k = 0; k < shown; k++) print_titles(columns[k], columns[k] + 1);
+  }
+  for (int i = 0; i < BUILDERS; i++) {
+    printf("\n  %-13s", builders[i].name);
+    for (int turn = 0; turn < b->turns; turn++) {
+      printf("  |%12s", "");
+      for (int k = 0; k < shown; k++) print_number(width_of(columns[k]), 2, geometric_mean(b, turn, i, columns[k]));
+    }
+  }
+  puts("");
+}
+
+static double mean_ns(const bench *b, int turn, int number, int column)
+{
+  double sum = 0;
+  for (size_t i = 0; i < b->input_count; i++) sum += ns_per_triangle(row_of(b, i, turn, number), column);
+  return sum / (double)b->input_count;
+}
+/* Amdahl's law: of the time t1 of one thread a share s stays serial, and n threads take t(n) = t1 (s + (1 - s) / n).
+ * The share is the one with which t(measured) = tm: more than 1 where more threads take longer. */
+static double time_with(double n, double t1, double tm, double measured)
+{
+  double s = t1 > 0 ? (tm / t1 - 1 / measured) / (1 - 1 / measured) : 0;
+  if (s < 0) s = 0;
+  return t1 * (s + (1 - s) / n);
+}
+static void print_speed_up(const bench *b)
+{
+  printf("\nspeed-up of %u threads over one, by mean ns/triangle, and what Amdahl's law for each stage estimates\n"
+         "%-15s%8s", b->threads[1], "", "all");
+  print_titles(STAGE, SAH);
+  printf("%12s%12s", "8 threads", "16 threads");
+  for (int i = 0; i < PRESETS; i++) {
+    double sum = 0, with_8 = 0, with_16 = 0;
+    printf("\n  %-13s", builders[i].name);
+    print_number(8, 2, mean_ns(b, 0, i, MS) / mean_ns(b, 1, i, MS));
+    for (int k = STAGE; k < SAH; k++) {
+      double t1 = mean_ns(b, 0, i, k), tm = mean_ns(b, 1, i, k);
+      print_number(width_of(k), 2, t1 > 0.05 && tm > 0 ? t1 / tm : -1);   /* less is the clock's */
+      sum += t1;
+      with_8 += time_with(8, t1, tm, b->threads[1]);
+      with_16 += time_with(16, t1, tm, b->threads[1]);
+    }
+    print_number(12, 2, sum / with_8);
+    print_number(12, 2, sum / with_16);
+  }
+  puts("");
+}
+static void print_adversaries(const bench *b)
+{
+  for (int turn = 0; turn < b->turns; turn++) {
+    printf("\nns/triangle, and times the first line's; triangles: %.0f; threads: %u\n%-26s", b->rows->triangles,
+           b->threads[turn], "");
+    for (int i = 0; i < BUILDERS; i++) printf("%20s", builders[i].name);
+    for (size_t m = 0; m < b->input_count; m++) {
+      printf("\n  %-24s", b->inputs[m].name);
+      for (int i = 0; i < BUILDERS; i++) {
+        double ns = ns_per_triangle(row_of(b, m, turn, i), MS);
+        if (ns < 0) printf("%20s", "failed");
+        else printf("%13.1f%7.2f", ns, ns / ns_per_triangle(row_of(b, 0, turn, i), MS));
+      }
+    }
+    puts("");
+  }
+}
+static void bench_meshes(bench *b)
+{
+  const input *built_in = b->adversarial ? adversaries : scenes;
+  size_t built_in_count = b->adversarial ? sizeof adversaries / sizeof *adversaries : sizeof scenes / sizeof *scenes;
+  if (b->input_count) built_in_count = 0;
+  for (size_t i = 0; i < built_in_count; i++) add_input(b, built_in[i]);
+  for (size_t i = 0; i < b->input_count; i++) b->total += b->inputs[i].size;
+  b->rows = (row *)ex_allocate(b->input_count * (size_t)b->turns * BUILDERS, sizeof *b->rows);
+  row *rows = b->rows;
+  for (size_t i = 0; i < b->input_count; i++) {
+    ex_mesh mesh = load(b, &b->inputs[i]);
+    for (int turn = 0; turn < b->turns; turn++, rows += BUILDERS) {
+      measure(b, &b->inputs[i], &mesh, turn, b->input_count - 1 - i, rows);
+      clear_progress();
+      if (!b->adversarial) print_rows(rows);
+    }
+    b->done += b->inputs[i].size;
+    ex_mesh_free(&mesh);
+  }
+  if (b->adversarial) print_adversaries(b);
+  else print_means(b);
+  if (!b->adversarial && b->turns > 1) print_speed_up(b);
+  free(b->rows);
+}
+
+// >>small meshes --------------------------------------------------------------------------------------------
+/* Of one build, which is repeated until some time has gone by. */
+static double small_ms(trbvh *tree, const trbvh_geometry *geometry, const trbvh_options *options, double at_least)
+{
+  double start = ex_now_ms(), ms;
+  uint32_t builds = 0;
+  do {
+    ex_check(trbvh_build(tree, geometry, options), "building", NULL);
+    ms = ex_now_ms() - start;
+    builds++;
+  } while (ms < at_least);
+  return ms / builds;
+}
+/* What does not grow with the mesh shows as the time that is more than the largest one's for as many triangles. */
+static void bench_small(bench *b)
+{
+  enum { SIZES = 6 };
+  static const unsigned sides[SIZES][2] = {{3, 2}, {5, 5}, {10, 5}, {15, 10}, {25, 20}, {100, 50}};
+  static double ms[SIZES][PRESETS][REPS_MAX];
+  ex_builder rocks[SIZES];
+  trbvh tree = {0};
+  ex_vec center = ex_v(0, 0, 0);
+  memset(rocks, 0, sizeof rocks);
+  for (int n = 0; n < SIZES; n++) ex_add_surface(&rocks[n], ex_rock_point, &center, sides[n][0], sides[n][1], 1);
+  for (int rep = 0; rep < b->reps; rep++) {
+    show_progress(b, "small meshes", 1, (double)rep / b->reps, 1);
+    for (int i = 0; i < SIZES * PRESETS; i++) {
+      trbvh_options options = options_of(i % PRESETS, 1, NULL);
+      trbvh_geometry geometry = ex_mesh_geometry(&rocks[i / PRESETS].mesh);
+      keep_scratch(&options, &geometry);
+      ms[i / PRESETS][i % PRESETS][rep] = small_ms(&tree, &geometry, &options, b->quick ? 10 : 50);
+      free(options.scratch);
+    }
+  }
+  clear_progress();
+  trbvh_free(&tree);
+  printf("\nsmall meshes, one thread; fixed: us/build - triangles * ns/tri of the last line\n  triangles");
+  for (int i = 0; i < PRESETS; i++) printf("  | %-12s us/build  ns/tri   fixed", builders[i].name);
+  for (int n = 0; n < SIZES; n++) {
+    double count = rocks[n].mesh.triangle_count, share = count / rocks[SIZES - 1].mesh.triangle_count;
+    printf("\n  %9.0f", count);
+    for (int i = 0; i < PRESETS; i++) {
+      row r = new_row("rock", count, 1, &builders[i], ex_median(ms[n][i], b->reps));
+      double us = 1e3 * r.values[MS], fixed = us - share * 1e3 * ex_median(ms[SIZES - 1][i], b->reps);
+      printf("  | %21.2f%8.1f%8.2f", us, 1e3 * us / count, fixed);
+      write_csv(b, &r);
+    }
+  }
+  puts("");
+  for (int n = 0; n < SIZES; n++) ex_mesh_free(&rocks[n].mesh);
+  b->done = 1;
+}
+
+/* Many meshes in the same arrays: mesh i is the triangles from first[i] to first[i + 1]. */
+typedef struct batch { const ex_mesh *mesh; const uint32_t *first; uint32_t count, threads; int preset; } batch;
+typedef struct share { const batch *of; uint32_t number; pthread_t thread; } share;
+
+static void *build_share(void *context)   /* of the meshes, every threads-th */
+{
+  const share *s = (const share *)context;
+  const batch *of = s->of;
+  trbvh_options options = options_of(of->preset, 1, NULL);
+  trbvh_geometry geometry = ex_mesh_geometry(of->mesh);
+  trbvh tree = {0};
+  geometry.count = 200;                 /* triangles of the largest mesh */
+  keep_scratch(&options, &geometry);
+  for (uint32_t i = s->number; i < of->count; i += of->threads) {
+    geometry.indices = of->mesh->indices + 3 * (size_t)of->first[i];
+    geometry.count = of->first[i + 1] - of->first[i];
+    ex_check(trbvh_build(&tree, &geometry, &options), "building", NULL);
+  }
+  trbvh_free(&tree);
+  free(options.scratch);
+  return NULL;
+}
+static double batch_ms(const batch *of)
+{
+  share *shares = (share *)ex_allocate(of->threads, sizeof *shares);
+  double start = ex_now_ms();
+  for (uint32_t i = of->threads; i-- > 0;) {   /* number 0 is this thread's */
+    shares[i].of = of;
+    shares[i].number = i;
+    if (i == 0) build_share(&shares[i]);
+    else if (pthread_create(&shares[i].thread, NULL, build_share, &shares[i])) ex_die("a thread cannot be started");
+  }
+  for (uint32_t i = 1; i < of->threads; i++) pthread_join(shares[i].thread, NULL);
+  free(shares);
+  return ex_now_ms() - start;
+}
+static void bench_batch(bench *b)
+{
+  static double ms[2][PRESETS][REPS_MAX];
+  uint32_t count = b->quick ? 10000 : 100000, seed = 1, *first = (uint32_t *)ex_allocate(count + 1, sizeof *first);
+  ex_builder built;
+  memset(&built, 0, sizeof built);
+  for (uint32_t i = 0; i < count; i++) {
+    unsigned across = 5 + ex_random_bits(&seed) % 6, down = 5 + ex_random_bits(&seed) % 6;
+    ex_vec center = random_point(&seed, -100, 100);
+    ex_add_surface(&built, ex_rock_point, &center, across, down, 1);
+    first[i + 1] = built.mesh.triangle_count;
+  }
+  if (built.failed) ex_die("not enough memory");
+  for (int rep = 0; rep < b->reps; rep++) {
+    show_progress(b, "a batch of small meshes", 1, (double)rep / b->reps, 0);
+    for (int i = 0; i < b->turns * PRESETS; i++) {
+      batch of = {&built.mesh, first, count, b->threads[i / PRESETS], i % PRESETS};
+      ms[i / PRESETS][i % PRESETS][rep] = batch_ms(&of);
+    }
+  }
+  clear_progress();
+  printf("\n%u meshes of 50 to 200 triangles, together %u; each is built by one thread, into a tree of the thread's\n"
+         "    threads", count, built.mesh.triangle_count);
+  for (int i = 0; i < PRESETS; i++) printf("  | %-12s       ms  Mtri/s  speed-up", builders[i].name);
+  for (int turn = 0; turn < b->turns; turn++) {
+    printf("\n  %9u", b->threads[turn]);
+    for (int i = 0; i < PRESETS; i++) {
+      double median = ex_median(ms[turn][i], b->reps);
+      row r = new_row("batch", built.mesh.triangle_count, b->threads[turn], &builders[i], median);
+      printf("  | %21.1f%8.2f%10.2f", median, r.values[RATE], ex_median(ms[0][i], b->reps) / median);
+      write_csv(b, &r);
+    }
+  }
+  puts("");
+  free(first);
+  ex_mesh_free(&built.mesh);
+}
+
+// >>main ----------------------------------------------------------------------------------------------------
+enum { OPTION_THREADS, OPTION_REPS, OPTION_CSV, OPTION_QUICK, OPTION_ADVERSARIAL, OPTION_SMALL, OPTIONS };
+static const ex_option options_known[OPTIONS] = {
+  {"--threads", EX_VALUE}, {"--reps", EX_VALUE}, {"--csv", EX_VALUE}, {"--quick", EX_NO_VALUE},
+  {"--adversarial", EX_NO_VALUE}, {"--small", EX_NO_VALUE}
+};
+static void set_option(void *user, int option, const char *value)
+{
+  bench *b = (bench *)user;
+  switch (option) {
+  case OPTION_THREADS: b->threads[1] = ex_parse_count(value, "--threads", 1024, NULL); break;
+  case OPTION_REPS: b->reps = (int)ex_parse_count(value, "--reps", REPS_MAX, NULL); break;
+  case OPTION_CSV: b->csv_path = value; break;
+  case OPTION_QUICK: b->quick = 1; break;
+  case OPTION_ADVERSARIAL: b->adversarial = 1; break;
+  case OPTION_SMALL: b->small = 1; break;
+  default: add_path(b, value);
+  }
+}
+int main(int argc, char **argv)
+{
+  bench b = {.threads = {1, ex_processors()}};
+  ex_arguments(argc, argv, usage, options_known, OPTIONS, set_option, &b);
+  if (b.adversarial + b.small + (b.input_count > 0) > 1) ex_die("meshes, --adversarial or --small, one at a time");
+  if (!b.reps) b.reps = b.quick ? 3 : 9;
+  b.turns = b.threads[1] > 1 ? 2 : 1;
+  if (b.csv_path) {
+    b.csv = fopen(b.csv_path, "w");
+    if (!b.csv) ex_die("%s: cannot be written", b.csv_path);
+    fputs(csv_header, b.csv);
+  }
+  b.start = ex_now_ms();
+  if (b.small) {
+    b.total = 2;
+    bench_small(&b);
+    bench_batch(&b);
+  } else bench_meshes(&b);
+  if (b.csv && fclose(b.csv)) ex_die("%s: cannot be written", b.csv_path);
+  free(b.inputs);
+  return 0;
+}
