@@ -1445,9 +1445,9 @@ static void trb_treelet_costs(const float *leaves, float *table, float *sums, tr
  *
  * First come all rounds over the top of the tree, the nodes of more than TRB_TOP references; then all rounds over what
  * is below, the subtrees of up to TRB_BLOCK references, one subtree after the other: so they are read from memory once,
- * not once a round, and are done then. The paper goes through the whole tree round by round; SAH is the same, 0.1 % better
- * on average of 22 meshes, and within 1.6 % on each. Nothing else is said about the order, and nothing depends on it:
- * numbers of nodes never break a tie.
+ * not once a round, and are done then. The paper goes through the whole tree round by round; SAH is the same, 0.1 %
+ * better on average of 22 meshes, and within 1.6 % on each. Nothing else is said about the order, and nothing depends
+ * on it: numbers of nodes never break a tie.
  *
  * On a CPU, roots of one depth are independent, and taken TRB_LANES at a time through the dynamic program. */
 typedef struct trb_treelets {
@@ -1461,13 +1461,16 @@ typedef struct trb_treelets {
   float     cost[TRB_LANES];                     /* of the present topology */
 } trb_treelets;
 
+/* A treelet leaf, whose children are asked for in case it is expanded. */
 TRB_CORE trb_u64 trb_slot(const TRB_GLOBAL trbvh_node *nodes, trbvh_u32 node, trbvh_u32 slot) {
   TRB_PREFETCH(&nodes[nodes[node].first]);
   return (trb_u64)trb_expand_key(nodes[node], slot) << 32 | node;
 }
 
+/* Replaces a treelet leaf by its children. Returns what that adds to the treelet's cost: a large node's area and the
+ * costs of its small children; nothing below a small node, whose cost is known. */
 TRB_CORE float trb_expand(const TRB_GLOBAL trbvh_node *nodes, TRB_WORK trb_treelets *t, trbvh_u32 lane, trbvh_u32 step,
-                         trbvh_u32 slot, trbvh_u32 node) {
+                          trbvh_u32 slot, trbvh_u32 node) {
   const trbvh_u32 pair = nodes[node].first, large = (nodes[node].count >> 31) - 1;
   const float cost = trb_area(nodes[node]) + (trb_cost(nodes[pair].count) + trb_cost(nodes[pair + 1].count));
   t->pair[step][lane] = pair;
@@ -1488,7 +1491,7 @@ TRB_CORE void trb_expand_largest(const TRB_GLOBAL trbvh_node *nodes, TRB_WORK tr
   t->cost[lane] += trb_expand(nodes, t, lane, step, TRB_TREELET - ((trbvh_u32)(best >> 32) & 7u), (trbvh_u32)best);
 }
 
-/* Hands treelet leaf i to the dynamic program. */
+/* Hands treelet leaf i to the dynamic program, which counts costs without the leaves' own. */
 TRB_CORE void trb_enter_leaf(const TRB_GLOBAL trbvh_node *nodes, TRB_WORK trb_treelets *t, trbvh_u32 lane, trbvh_u32 i) {
   const TRB_GLOBAL trbvh_node *leaf = &nodes[(trbvh_u32)t->slot[i][lane]];
   TRB_WORK float *value = &t->leaves[i * TRB_LEAF_VALUES * TRB_LANES + lane];
@@ -1567,7 +1570,6 @@ TRB_SHARED void trb_restructure(TRB_GLOBAL trbvh_node *nodes, TRB_WORK trb_treel
   trb_treelet_costs(t->leaves, t->table, t->sums, lanes, costs);
   for (lane = 0; lane < lanes; lane++) trb_finish_treelet(nodes, t, t->sums + lane, lane, roots[lane], costs);
 }
-
 #endif
 
 /* Scratch memory: four words a reference, free once the hierarchy is built. */
@@ -1615,7 +1617,7 @@ TRB_SHARED void trb_restructure_below(TRB_GLOBAL trbvh_node *nodes, trb_words wo
   }
 }
 
-/* First: the top of the tree. */
+/* What comes first: the top of the tree. */
 TRB_SHARED void trb_restructure_top(TRB_GLOBAL trbvh_node *nodes, trb_words words, trbvh_u32 rounds, trb_costs costs) {
   for (; rounds && trb_count(nodes[0].count) > TRB_TOP; rounds--) {
     words.plane[0][0] = 0;

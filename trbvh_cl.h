@@ -1151,13 +1151,16 @@ static const char *const trb_cl_text[] = {
   "  float     cost[TRB_LANES];\n",
   "} trb_treelets;\n",
   "\n",
+  "\n",
   "TRB_CORE trb_u64 trb_slot(const TRB_GLOBAL trbvh_node *nodes, trbvh_u32 node, trbvh_u32 slot) {\n",
   "  TRB_PREFETCH(&nodes[nodes[node].first]);\n",
   "  return (trb_u64)trb_expand_key(nodes[node], slot) << 32 | node;\n",
   "}\n",
   "\n",
+  "\n",
+  "\n",
   "TRB_CORE float trb_expand(const TRB_GLOBAL trbvh_node *nodes, TRB_WORK trb_treelets *t, trbvh_u32 lane, trbvh_u32 step,\n",
-  "                         trbvh_u32 slot, trbvh_u32 node) {\n",
+  "                          trbvh_u32 slot, trbvh_u32 node) {\n",
   "  const trbvh_u32 pair = nodes[node].first, large = (nodes[node].count >> 31) - 1;\n",
   "  const float cost = trb_area(nodes[node]) + (trb_cost(nodes[pair].count) + trb_cost(nodes[pair + 1].count));\n",
   "  t->pair[step][lane] = pair;\n",
@@ -1257,7 +1260,6 @@ static const char *const trb_cl_text[] = {
   "  trb_treelet_costs(t->leaves, t->table, t->sums, lanes, costs);\n",
   "  for (lane = 0; lane < lanes; lane++) trb_finish_treelet(nodes, t, t->sums + lane, lane, roots[lane], costs);\n",
   "}\n",
-  "\n",
   "#endif\n",
   "\n",
   "\n",
@@ -1313,7 +1315,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "}\n",
   "#endif\n",
-  "#line 1637 \"trbvh.h\"\n",
+  "#line 1639 \"trbvh.h\"\n",
   "typedef struct trb_collapser {\n",
   "  TRB_GLOBAL trbvh_node *nodes;\n",
   "  trb_words words;\n",
@@ -1491,7 +1493,7 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE void trb_prefetch_pairs(const trb_collapser *c, trbvh_u32 ref, trbvh_u32 count) {\n",
   "  for (; count-- && ref > 2 * TRB_AHEAD; ref--) TRB_PREFETCH(&c->nodes[2 * (ref - 2 * TRB_AHEAD)]);\n",
   "}\n",
-  "#line 1818 \"trbvh.h\"\n",
+  "#line 1820 \"trbvh.h\"\n",
   "TRB_SHARED void trb_settle_task(const trb_collapser *c, TRB_GLOBAL trb_task *task) {\n",
   "  TRB_GLOBAL trbvh_u32 *order = c->words.plane[0] + task->first_ref, *prims = c->words.plane[1] + task->first_ref;\n",
   "  trbvh_u32 waiting = 0, child = task->node, siblings = 1, pairs = 0, refs = task->first_ref, prim = 0, max_depth = 0, i;\n",
@@ -1626,7 +1628,7 @@ static const char *const trb_cl_text[] = {
   "    default: trb_make_form(mesh, 4, prims, first, end, out); break;\n",
   "  }\n",
   "}\n",
-  "#line 1963 \"trbvh.h\"\n",
+  "#line 1965 \"trbvh.h\"\n",
   "#define TRB_UNIT 5.9604645e-8f\n",
   "#define TRB_ABS(x) ((x) < 0 ? -(x) : (x))\n",
   "typedef struct trb_ray {\n",
@@ -1704,7 +1706,7 @@ static const char *const trb_cl_text[] = {
   "  along = TRB_MIN(along, 1);\n",
   "  return TRB_MAX(along, 0);\n",
   "}\n",
-  "#line 2047 \"trbvh.h\"\n",
+  "#line 2049 \"trbvh.h\"\n",
   "TRB_CORE int trb_hit_triangle(const TRB_GLOBAL trbvh_triangle *t, const trb_ray *r, float tmax, trbvh_hit *hit) {\n",
   "  const int x = r->axis[0], y = r->axis[1], z = r->axis[2];\n",
   "  const trb_corner a = trb_see(t->v0[x], t->v0[y], t->v0[z], r);\n",
@@ -1745,7 +1747,7 @@ static const char *const trb_cl_text[] = {
   "  hit->u = hit->v = 0;\n",
   "  hit->prim = hit->instance = TRBVH_NONE;\n",
   "}\n",
-  "#line 2091 \"trbvh.h\"\n",
+  "#line 2093 \"trbvh.h\"\n",
   "TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbvh_triangle *triangles,\n",
   "                       const trb_ray *r, int any, trbvh_hit *hit) {\n",
   "  trbvh_u32 stack_node[TRBVH_MAX_DEPTH], height = 0, node = 0, i;\n",
@@ -2933,9 +2935,9 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "#endif\n",
 };
-#define TRB_CL_CORE_LINES 1740u   /* entries of trb_cl_text for user kernels: types, core, traversal */
-#define TRB_CL_LINES      2815u   /* all entries */
-#define TRB_CL_HASH       "f57c9c4f6c795d54"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_CORE_LINES 1742u   /* entries of trb_cl_text for user kernels: types, core, traversal */
+#define TRB_CL_LINES      2817u   /* all entries */
+#define TRB_CL_HASH       "a0c0f4cbe8786b53"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {

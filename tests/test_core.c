@@ -1172,7 +1172,7 @@ static void test_split_budget(void) {
     CHECK(trb_read(&b) == TRBVH_OK && trb_split(&b) == TRBVH_OK);
     for (i = 0; i < b.block_count; i++) sum += b.blocks[i].splits;
     CHECK_MSG(sum <= b.split_max && sum > b.split_max * 9 / 10, "%u splits of %u", (unsigned)sum, b.split_max);
-    for (i = slots = 0; i < b.block_count; i++) slots += b.blocks[i].slots;
+    for (i = 0, slots = 0; i < b.block_count; i++) slots += b.blocks[i].slots;
     CHECK_MSG(slots == COUNT + sum && slots <= b.ref_max, "%u slots", (unsigned)slots);
     CHECK(b.ref_count <= slots && b.ref_count > COUNT + b.split_max * 8 / 10);
     end_build(&b);
