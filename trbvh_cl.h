@@ -2211,11 +2211,11 @@ static const char *const trb_cl_text[] = {
   "  const trb_grid grid = plan->grid;\n",
   "  const trb_key_form form = plan->form;\n",
   "  const uint first = TRB_GROUP_ID * TRB_TILE, end = min(plan->slots, first + TRB_TILE);\n",
-  "  uint i, at = trb_has_gaps(plan) ? starts[TRB_GROUP_ID] : first, total = TRB_GROUP;\n",
+  "  uint i, at = trb_has_gaps(plan) ? starts[TRB_GROUP_ID] : first, total;\n",
   "  for (i = first; i < end; i += TRB_GROUP, at += total) {\n",
   "    const uint mine = i + TRB_LOCAL_ID;\n",
   "    const bool valid = mine < end && refs[mine].first != TRBVH_NONE;\n",
-  "    const uint before = trb_has_gaps(plan) ? trb_scan(valid, space, &total) : TRB_LOCAL_ID;\n",
+  "    const uint before = trb_scan(valid, space, &total);\n",
   "    if (valid) keys[at + before] = trb_key(trb_box_code(refs[mine], grid), mine, form, 0);\n",
   "  }\n",
   "}\n",
@@ -2937,7 +2937,7 @@ static const char *const trb_cl_text[] = {
 };
 #define TRB_CL_CORE_LINES 1742u   /* entries of trb_cl_text for user kernels: types, core, traversal */
 #define TRB_CL_LINES      2817u   /* all entries */
-#define TRB_CL_HASH       "a0c0f4cbe8786b53"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_HASH       "b539164262607ddc"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
@@ -3601,8 +3601,9 @@ static void trb_cl_launch(trb_cl *cl, int index, size_t groups, ...) {
   }
   va_start(list, groups);
   for (spec += *spec == '*'; *spec && !error; spec++, i++) {
-    if (*spec == 't') {                              /* our own trb_treelets has other lanes */
-      const size_t padding = 16 * sizeof(float), lane = (sizeof(trb_treelets) - padding) / TRB_LANES;
+    if (*spec == 't') {                              /* our own trb_treelets has other lanes, and sums */
+      const size_t padding = 16 * sizeof(float), sums = sizeof(((trb_treelets *)0)->sums);
+      const size_t lane = (sizeof(trb_treelets) - sums - padding) / TRB_LANES;
       error = cl->api.SetKernelArg(cl->kernels[index], i, lane * TRB_GPU_LANES + padding, NULL);
     } else if (*spec == 'b') {
       trb_cl_mem buffer = va_arg(list, trb_cl_mem);

@@ -8,11 +8,11 @@ TRB_KERNEL trb_k_keys(const __global trb_plan *plan, const __global trbvh_node *
   const trb_grid grid = plan->grid;
   const trb_key_form form = plan->form;
   const uint first = TRB_GROUP_ID * TRB_TILE, end = min(plan->slots, first + TRB_TILE);
-  uint i, at = trb_has_gaps(plan) ? starts[TRB_GROUP_ID] : first, total = TRB_GROUP;
+  uint i, at = trb_has_gaps(plan) ? starts[TRB_GROUP_ID] : first, total;
   for (i = first; i < end; i += TRB_GROUP, at += total) {
     const uint mine = i + TRB_LOCAL_ID;
     const bool valid = mine < end && refs[mine].first != TRBVH_NONE;
-    const uint before = trb_has_gaps(plan) ? trb_scan(valid, space, &total) : TRB_LOCAL_ID;
+    const uint before = trb_scan(valid, space, &total);          /* always: llvmpipe gets barriers on a condition wrong */
     if (valid) keys[at + before] = trb_key(trb_box_code(refs[mine], grid), mine, form, 0);
   }
 }
