@@ -1184,7 +1184,9 @@ TRB_SHARED void trb_place_digits(TRB_GLOBAL trbvh_u32 *histograms, trbvh_u32 blo
 typedef struct trb_curve {
   const TRB_GLOBAL trb_u64    *keys;
   const TRB_GLOBAL trbvh_node *refs;
+#ifndef TRBVH_OPENCL_C
   const trb_mesh              *mesh;
+#endif
   trb_grid     grid;
   trb_key_form form;
   trbvh_u32    count;
@@ -1753,7 +1755,7 @@ typedef struct trb_group { trbvh_u32 first_task, tasks; } trb_group;
 #define TRB_GROUPS_MAX(refs) (4 * ((refs) / TRB_BLOCK) + 4)
 
 /* Finds the tasks, returns how many, and sums up equation 1 above them. */
-TRB_SHARED trbvh_u32 trb_find_tasks(const trb_collapser *c, TRB_GLOBAL trb_task *tasks, TRB_REAL *sah) {
+TRB_CORE trbvh_u32 trb_find_tasks(const trb_collapser *c, TRB_GLOBAL trb_task *tasks, TRB_REAL *sah) {
   trbvh_u32 stack[TRBVH_MAX_DEPTH + 1], depths[TRBVH_MAX_DEPTH + 1], waiting = 0, refs = 0, node = 0, depth = 0, count = 0;
   *sah = 0;
   for (;;) {
@@ -1777,7 +1779,7 @@ TRB_SHARED trbvh_u32 trb_find_tasks(const trb_collapser *c, TRB_GLOBAL trb_task 
 }
 
 /* Deals them out; returns the number of groups. */
-TRB_SHARED trbvh_u32 trb_find_groups(const TRB_GLOBAL trb_task *tasks, trbvh_u32 count, TRB_GLOBAL trb_group *groups) {
+TRB_CORE trbvh_u32 trb_find_groups(const TRB_GLOBAL trb_task *tasks, trbvh_u32 count, TRB_GLOBAL trb_group *groups) {
   trbvh_u32 groups_found = 0, first_ref = 0, i;
   for (i = 0; i < count; i++) {
     if (i == 0 || tasks[i].first_ref - first_ref >= TRB_BLOCK / 4) {

@@ -908,7 +908,9 @@ static const char *const trb_cl_text[] = {
   "typedef struct trb_curve {\n",
   "  const TRB_GLOBAL trb_u64    *keys;\n",
   "  const TRB_GLOBAL trbvh_node *refs;\n",
-  "  const trb_mesh              *mesh;\n",
+  "\n",
+  "\n",
+  "\n",
   "  trb_grid     grid;\n",
   "  trb_key_form form;\n",
   "  trbvh_u32    count;\n",
@@ -917,7 +919,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "TRB_CORE trbvh_node trb_curve_ref(const trb_curve *c, trb_u64 key) {\n",
   "  const trbvh_u32 ref = trb_key_ref(key, c->form);\n",
-  "#line 1206 \"trbvh.h\"\n",
+  "#line 1208 \"trbvh.h\"\n",
   "  return c->refs[ref];\n",
   "}\n",
   "\n",
@@ -925,7 +927,7 @@ static const char *const trb_cl_text[] = {
   "TRB_SHARED void trb_read_leaves(const trb_curve *c, trbvh_u32 first, trbvh_u32 count, trbvh_u32 end, trb_row *row) {\n",
   "  const trbvh_u32 next = first + count, soon = TRB_MIN(next + TRB_ROW, end);\n",
   "  trbvh_u32 i, k;\n",
-  "#line 1223 \"trbvh.h\"\n",
+  "#line 1225 \"trbvh.h\"\n",
   "  for (i = next; i < soon; i++) TRB_PREFETCH(&c->refs[trb_key_ref(c->keys[i], c->form)]);\n",
   "  for (i = 0; i < count; i++) {\n",
   "    const trbvh_node ref = c->refs[trb_key_ref(c->keys[first + i], c->form)];\n",
@@ -1021,7 +1023,7 @@ static const char *const trb_cl_text[] = {
   "      trb_push(&f, ranges[i].open[k].node, ranges[i].open[k].split, ranges[i].open[k].pair);\n",
   "  TRBVH_ASSERT(f.height == 1);\n",
   "}\n",
-  "#line 1322 \"trbvh.h\"\n",
+  "#line 1324 \"trbvh.h\"\n",
   "#define TRB_LANE_LOAD(p)     (*(p))\n",
   "#define TRB_LANE_STORE(p, x) (*(p) = (x))\n",
   "#define TRB_LANE_OF(x)       (x)\n",
@@ -1139,7 +1141,7 @@ static const char *const trb_cl_text[] = {
   "  for (lane = 0; lane < lanes; lane++) trb_treelet_costs_1(leaves + lane, table + lane, sums + lane, costs);\n",
   "}\n",
   "#endif\n",
-  "#line 1453 \"trbvh.h\"\n",
+  "#line 1455 \"trbvh.h\"\n",
   "typedef struct trb_treelets {\n",
   "  float     leaves[TRB_TREELET * TRB_LEAF_VALUES * TRB_LANES];\n",
   "  float     table[TRB_SUBSETS * TRB_LANES + 16];\n",
@@ -1315,7 +1317,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "}\n",
   "#endif\n",
-  "#line 1639 \"trbvh.h\"\n",
+  "#line 1641 \"trbvh.h\"\n",
   "typedef struct trb_collapser {\n",
   "  TRB_GLOBAL trbvh_node *nodes;\n",
   "  trb_words words;\n",
@@ -1433,7 +1435,7 @@ static const char *const trb_cl_text[] = {
   "#define TRB_GROUPS_MAX(refs) (4 * ((refs) / TRB_BLOCK) + 4)\n",
   "\n",
   "\n",
-  "TRB_SHARED trbvh_u32 trb_find_tasks(const trb_collapser *c, TRB_GLOBAL trb_task *tasks, TRB_REAL *sah) {\n",
+  "TRB_CORE trbvh_u32 trb_find_tasks(const trb_collapser *c, TRB_GLOBAL trb_task *tasks, TRB_REAL *sah) {\n",
   "  trbvh_u32 stack[TRBVH_MAX_DEPTH + 1], depths[TRBVH_MAX_DEPTH + 1], waiting = 0, refs = 0, node = 0, depth = 0, count = 0;\n",
   "  *sah = 0;\n",
   "  for (;;) {\n",
@@ -1457,7 +1459,7 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "\n",
   "\n",
-  "TRB_SHARED trbvh_u32 trb_find_groups(const TRB_GLOBAL trb_task *tasks, trbvh_u32 count, TRB_GLOBAL trb_group *groups) {\n",
+  "TRB_CORE trbvh_u32 trb_find_groups(const TRB_GLOBAL trb_task *tasks, trbvh_u32 count, TRB_GLOBAL trb_group *groups) {\n",
   "  trbvh_u32 groups_found = 0, first_ref = 0, i;\n",
   "  for (i = 0; i < count; i++) {\n",
   "    if (i == 0 || tasks[i].first_ref - first_ref >= TRB_BLOCK / 4) {\n",
@@ -1493,7 +1495,7 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE void trb_prefetch_pairs(const trb_collapser *c, trbvh_u32 ref, trbvh_u32 count) {\n",
   "  for (; count-- && ref > 2 * TRB_AHEAD; ref--) TRB_PREFETCH(&c->nodes[2 * (ref - 2 * TRB_AHEAD)]);\n",
   "}\n",
-  "#line 1820 \"trbvh.h\"\n",
+  "#line 1822 \"trbvh.h\"\n",
   "TRB_SHARED void trb_settle_task(const trb_collapser *c, TRB_GLOBAL trb_task *task) {\n",
   "  TRB_GLOBAL trbvh_u32 *order = c->words.plane[0] + task->first_ref, *prims = c->words.plane[1] + task->first_ref;\n",
   "  trbvh_u32 waiting = 0, child = task->node, siblings = 1, pairs = 0, refs = task->first_ref, prim = 0, max_depth = 0, i;\n",
@@ -1628,7 +1630,7 @@ static const char *const trb_cl_text[] = {
   "    default: trb_make_form(mesh, 4, prims, first, end, out); break;\n",
   "  }\n",
   "}\n",
-  "#line 1965 \"trbvh.h\"\n",
+  "#line 1967 \"trbvh.h\"\n",
   "#define TRB_UNIT 5.9604645e-8f\n",
   "#define TRB_ABS(x) ((x) < 0 ? -(x) : (x))\n",
   "typedef struct trb_ray {\n",
@@ -1706,7 +1708,7 @@ static const char *const trb_cl_text[] = {
   "  along = TRB_MIN(along, 1);\n",
   "  return TRB_MAX(along, 0);\n",
   "}\n",
-  "#line 2049 \"trbvh.h\"\n",
+  "#line 2051 \"trbvh.h\"\n",
   "TRB_CORE int trb_hit_triangle(const TRB_GLOBAL trbvh_triangle *t, const trb_ray *r, float tmax, trbvh_hit *hit) {\n",
   "  const int x = r->axis[0], y = r->axis[1], z = r->axis[2];\n",
   "  const trb_corner a = trb_see(t->v0[x], t->v0[y], t->v0[z], r);\n",
@@ -1747,7 +1749,7 @@ static const char *const trb_cl_text[] = {
   "  hit->u = hit->v = 0;\n",
   "  hit->prim = hit->instance = TRBVH_NONE;\n",
   "}\n",
-  "#line 2093 \"trbvh.h\"\n",
+  "#line 2095 \"trbvh.h\"\n",
   "TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbvh_triangle *triangles,\n",
   "                       const trb_ray *r, int any, trbvh_hit *hit) {\n",
   "  trbvh_u32 stack_node[TRBVH_MAX_DEPTH], height = 0, node = 0, i;\n",
@@ -2205,18 +2207,29 @@ static const char *const trb_cl_text[] = {
   "#endif\n",
   "#ifdef TRB_WITH_MORTON\n",
   "#line 5 \"kernels/morton.cl\"\n",
-  "TRB_KERNEL trb_k_keys(const __global trb_plan *plan, const __global trbvh_node *refs, const __global uint *starts,\n",
-  "                      __global ulong *keys) {\n",
+  "TRB_KERNEL trb_k_keys(const __global trb_plan *plan, const __global trbvh_node *refs, __global ulong *keys) {\n",
+  "  const trb_grid grid = plan->grid;\n",
+  "  const trb_key_form form = plan->form;\n",
+  "  const uint count = trb_has_gaps(plan) ? 0 : plan->slots;\n",
+  "  uint i;\n",
+  "  TRB_FOR(i, count) keys[i] = trb_key(trb_box_code(refs[i], grid), i, form, 0);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_gap_keys(const __global trb_plan *plan, const __global trbvh_node *refs, const __global uint *starts,\n",
+  "                          __global ulong *keys) {\n",
   "  __local uint space[TRB_GROUP];\n",
   "  const trb_grid grid = plan->grid;\n",
   "  const trb_key_form form = plan->form;\n",
   "  const uint first = TRB_GROUP_ID * TRB_TILE, end = min(plan->slots, first + TRB_TILE);\n",
-  "  uint i, at = trb_has_gaps(plan) ? starts[TRB_GROUP_ID] : first, total;\n",
-  "  for (i = first; i < end; i += TRB_GROUP, at += total) {\n",
+  "  uint i, start = starts[TRB_GROUP_ID], total;\n",
+  "  if (!trb_has_gaps(plan)) return;\n",
+  "  for (i = first; i < end; i += TRB_GROUP) {\n",
   "    const uint mine = i + TRB_LOCAL_ID;\n",
   "    const bool valid = mine < end && refs[mine].first != TRBVH_NONE;\n",
   "    const uint before = trb_scan(valid, space, &total);\n",
-  "    if (valid) keys[at + before] = trb_key(trb_box_code(refs[mine], grid), mine, form, 0);\n",
+  "    if (valid) keys[start + before] = trb_key(trb_box_code(refs[mine], grid), mine, form, 0);\n",
+  "    start += total;\n",
   "  }\n",
   "}\n",
   "\n",
@@ -2336,7 +2349,6 @@ static const char *const trb_cl_text[] = {
   "  trb_curve curve;\n",
   "  curve.keys = keys;\n",
   "  curve.refs = refs;\n",
-  "  curve.mesh = 0;\n",
   "  curve.grid = plan->grid;\n",
   "  curve.form = plan->form;\n",
   "  curve.count = plan->ref_count;\n",
@@ -2358,7 +2370,7 @@ static const char *const trb_cl_text[] = {
   "  if (count) trb_build_top(nodes, ranges, (count - 1) / TRB_BLOCK + 1, plan->costs);\n",
   "}\n",
   "#else\n",
-  "#line 40 \"kernels/hierarchy.cl\"\n",
+  "#line 39 \"kernels/hierarchy.cl\"\n",
   "static void trb_hang(const trb_curve *curve, __global trbvh_node *nodes, __global trb_wait *waits, trbvh_node node,\n",
   "                     uint first, uint last) {\n",
   "  const ulong left = trb_split_after(curve, first - 1), right = trb_split_after(curve, last);\n",
@@ -2627,13 +2639,13 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "#else\n",
   "\n",
-  "static uint trb_count_prims(const trb_collapser *c, trbvh_node leaf) {\n",
+  "TRB_CORE uint trb_count_prims(const trb_collapser *c, trbvh_node leaf) {\n",
   "  uint prims[TRB_MAX_LEAF];\n",
   "  return c->split ? trb_leaf_prims(c, leaf, prims) : trb_count(leaf.count);\n",
   "}\n",
   "\n",
   "\n",
-  "static uint trb_emit_leaf(const trb_collapser *c, trbvh_node node, uint dst, uint first) {\n",
+  "TRB_CORE uint trb_emit_leaf(const trb_collapser *c, trbvh_node node, uint dst, uint first) {\n",
   "  uint prims[TRB_MAX_LEAF], i;\n",
   "  node.count = trb_leaf_prims(c, node, prims);\n",
   "  node.first = first;\n",
@@ -2935,9 +2947,9 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "#endif\n",
 };
-#define TRB_CL_CORE_LINES 1742u   /* entries of trb_cl_text for user kernels: types, core, traversal */
-#define TRB_CL_LINES      2817u   /* all entries */
-#define TRB_CL_HASH       "b539164262607ddc"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_CORE_LINES 1744u   /* entries of trb_cl_text for user kernels: types, core, traversal */
+#define TRB_CL_LINES      2829u   /* all entries */
+#define TRB_CL_HASH       "42f812ad5778a9cc"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
@@ -3156,7 +3168,8 @@ static int trb_cl_load(trb_cl_api *api, trbvh_stats *stats) {
   X(BUILD, scan, "bu") \
   X(SPLIT, priorities, "bbbbbb")      X(SPLIT, priority_unit, "bbu")      X(SPLIT, sum_splits, "bbbu") \
   X(SPLIT, choose_scale, "bbuu")      X(SPLIT, count_slots, "bbbb")       X(SPLIT, split, "bbbbbbbb") \
-  X(SPLIT, sum_refs, "bbu")           X(BUILD, keys, "bbbb")              X(BUILD, high_keys, "bbb") \
+  X(SPLIT, sum_refs, "bbu")           X(BUILD, keys, "bbb")              X(BUILD, gap_keys, "bbbb") \
+  X(BUILD, high_keys, "bbb") \
   X(BUILD, count_digits, "bbbu")      X(BUILD, place_digits, "bu")        X(BUILD, scatter_keys, "bbbbu") \
   X(BUILD, sum_tiles, "bbu")          X(BUILD, scan_tiles, "bbu") \
   X(BUILD, build_blocks, "bbbbb")     X(BUILD, build_top, "bbb") \
@@ -3898,7 +3911,8 @@ static void trb_cl_make_keys(trb_cl_work *w) {
   trb_cl *cl = w->cl;
   trb_cl_launch(cl, TRB_CL_BUILD_count_refs, w->tiles, w->state, w->refs, w->counts);
   trb_cl_launch(cl, TRB_CL_BUILD_scan, 1, w->counts, w->tiles);
-  trb_cl_launch(cl, TRB_CL_BUILD_keys, w->tiles, w->state, w->refs, w->counts, w->keys);
+  trb_cl_launch(cl, TRB_CL_BUILD_keys, w->spread, w->state, w->refs, w->keys);
+  trb_cl_launch(cl, TRB_CL_BUILD_gap_keys, w->tiles, w->state, w->refs, w->counts, w->keys);
 }
 
 static void trb_cl_sort_keys(trb_cl_work *w) {
@@ -3978,7 +3992,7 @@ static trbvh_result trb_cl_restructure(trb_cl_work *w) {
     trb_cl_round(w, TRB_TOP + 1, TRBVH_NONE);
     if (trb_stage(&w->b->runner, 0.05f)) return TRBVH_CANCELLED;
   }
-  trb_cl_find_tasks(w);
+  if (w->b->ref_max > TRB_BLOCK) trb_cl_find_tasks(w);         /* for the depth bound above them */
   for (round = 0, gamma = TRB_TREELET; round < rounds && gamma <= TRB_MIN(TRB_BLOCK, w->b->ref_max); round++, gamma *= 2) {
     trb_cl_round(w, gamma, TRB_BLOCK);
     if (trb_stage(&w->b->runner, 0.05f)) return TRBVH_CANCELLED;

@@ -59,13 +59,13 @@ TRB_KERNEL trb_k_emit_tasks(const __global trb_plan *plan, __global trbvh_node *
 }
 #else
 /* Inner nodes are listed level by level; their sums go from the bottom up, their places from the top down. */
-static uint trb_count_prims(const trb_collapser *c, trbvh_node leaf) {
+TRB_CORE uint trb_count_prims(const trb_collapser *c, trbvh_node leaf) {
   uint prims[TRB_MAX_LEAF];
   return c->split ? trb_leaf_prims(c, leaf, prims) : trb_count(leaf.count);
 }
 
 /* Writes a leaf whose primitives begin at `first`; returns how many they are. */
-static uint trb_emit_leaf(const trb_collapser *c, trbvh_node node, uint dst, uint first) {
+TRB_CORE uint trb_emit_leaf(const trb_collapser *c, trbvh_node node, uint dst, uint first) {
   uint prims[TRB_MAX_LEAF], i;
   node.count = trb_leaf_prims(c, node, prims);
   node.first = first;

@@ -5,7 +5,6 @@ static trb_curve trb_plan_curve(const __global trb_plan *plan, const __global ul
   trb_curve curve;
   curve.keys = keys;
   curve.refs = refs;
-  curve.mesh = 0;
   curve.grid = plan->grid;
   curve.form = plan->form;
   curve.count = plan->ref_count;
