@@ -3759,10 +3759,10 @@ static trb_cl_mem trb_cl_input(trb_cl *cl, const void *host, size_t size) {
 // >>stages ---- a build: buffers, and the kernels of every stage in the order of trbvh.h ------------------------------
 /* Buffers are shared by what comes one after the other; R is b->ref_max:
  *
- *     nodes  64 R   references before splitting, and while gaps are closed; build nodes
- *     refs   32 R   references; CPU: treelets' lists; spare nodes of the collapse
- *     keys    8 R   priorities; keys; CPU: nodes above groups; spare words of the collapse
- *     sorted  8 R   what splitting found; keys; GPU: what splits wait for; spare words of the collapse
+ *     nodes  64 R   references before splitting; build nodes
+ *     refs   32 R   references, with gaps
+ *     keys    8 R   priorities; keys; words for treelets (CPU) and the collapse
+ *     sorted  8 R   what splitting found; keys; GPU: what splits wait for; more such words
  *     counts        of tiles; of digits; of waiting splits
  *     GPU: lists 4 R and marks 4 R: waiting splits; nodes by level, where their references begin; places 24 R
  *     CPU: ranges, groups, tasks
