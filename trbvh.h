@@ -808,17 +808,23 @@ TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {
 #define TRB_AHEAD 32u                    /* how far ahead random reads are asked for */
 
 /* Host memory may have any alignment. */
-TRB_CORE void trb_load_position(float out[3], const TRB_GLOBAL char *p) {
-#ifdef TRBVH_OPENCL_C
-  const __global float *position = (const __global float *)p;
-  out[0] = position[0];
-  out[1] = position[1];
-  out[2] = position[2];
+TRB_CORE float trb_load_float(const TRB_GLOBAL char *p) {
+#if defined(TRBVH_OPENCL_C)
+  return *(const __global float *)p;
+#elif defined(__GNUC__)                  /* gcc sends what memcpy copies through other registers */
+  typedef float loose_float __attribute__((aligned(1), may_alias));
+  return *(const loose_float *)p;
 #else
-  memcpy(&out[0], p, 4);                             /* one by one: gcc sends the three of them through the stack */
-  memcpy(&out[1], p + 4, 4);
-  memcpy(&out[2], p + 8, 4);
+  float x;
+  memcpy(&x, p, 4);
+  return x;
 #endif
+}
+
+TRB_CORE void trb_load_position(float out[3], const TRB_GLOBAL char *p) {
+  out[0] = trb_load_float(p);
+  out[1] = trb_load_float(p + 4);
+  out[2] = trb_load_float(p + 8);
 }
 
 TRB_CORE trbvh_u32 trb_index16(const trb_mesh *mesh, size_t i) {
@@ -1010,8 +1016,9 @@ TRB_CORE void trb_prefetch_row(const trb_mesh *mesh, trbvh_u32 count, const trb_
 /* Empties the invalid boxes of a row, which are few: where a coordinate is infinite or NaN, so is the sum of all. */
 TRB_SHARED trbvh_u32 trb_check_row(const trb_mesh *mesh, trbvh_u32 count, trb_row *row) {
   trbvh_u32 i, k, suspect = 0, valid = count;
-  for (i = 0; i < count; i++) suspect |= !trb_finite(row->check[i]);
-  for (i = 0; i < count; i++) row->valid[i] = 1;
+  for (i = count; i < TRB_ROW; i++) row->check[i] = 0;
+  for (i = 0; i < TRB_ROW; i++) suspect |= !trb_finite(row->check[i]);
+  for (i = 0; i < TRB_ROW; i++) row->valid[i] = 1;
   for (i = 0; suspect && i < count; i++) {
     trbvh_node box;
     trbvh_u32 vertex;
@@ -2654,14 +2661,17 @@ static void trb_read_job(void *context, uint32_t index) {
   block.slots = end - first;
   block.bad = TRBVH_NONE;
   for (k = 0; k < 3; k++)
-    for (i = 0; i < TRB_ROW; i++) { all.min[k][i] = FLT_MAX; all.max[k][i] = -FLT_MAX; }
+    for (i = 0; i < TRB_ROW; i++) {
+      all.min[k][i] = row.min[k][i] = FLT_MAX;
+      all.max[k][i] = row.max[k][i] = -FLT_MAX;
+    }
   for (; first < end && block.bad == TRBVH_NONE; first += n) {
     n = TRB_MIN(end - first, TRB_ROW);
     for (i = 0; i < n; i++) row.prim[i] = first + i;
     good = trb_read_row(&b->input, n, &row);
     block.refs += trb_check_row(&b->input, good, &row);
-    for (k = 0; k < 3; k++)
-      for (i = 0; i < good; i++) {
+    for (k = 0; k < 3; k++)                          /* whole rows, whose ends are empty or have been here before */
+      for (i = 0; i < TRB_ROW; i++) {
         all.min[k][i] = TRB_MIN(row.min[k][i], all.min[k][i]);
         all.max[k][i] = TRB_MAX(row.max[k][i], all.max[k][i]);
       }
