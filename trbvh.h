@@ -1248,8 +1248,14 @@ TRB_CORE trb_u64 trb_split_after(const trb_curve *c, trbvh_u32 i) {
   return code ? code | (trb_u64)1 << 63 : (trbvh_u32)(a ^ b);
 }
 
-/* A subtree whose parent reaches beyond its block, what splits it from its right neighbour, and that split's pair. */
-typedef struct trb_open { trbvh_node node; trb_u64 split; trbvh_u32 pair; } trb_open;
+/* A subtree whose parent reaches beyond its block, what splits it from its right neighbour, and the pair that split
+ * makes. Of a final tree also: where its last reference's primitive stands in the result, and its pairs, the root's
+ * children being the last of them. */
+typedef struct trb_open {
+  trbvh_node node;
+  trb_u64    split;
+  trbvh_u32  pair, prim, first_pair, end_pair;
+} trb_open;
 typedef struct trb_range { trbvh_u32 open_count; trb_open open[TRB_OPEN_MAX]; } trb_range;
 
 typedef struct trb_forest {
@@ -1258,38 +1264,66 @@ typedef struct trb_forest {
   trb_costs  costs;
   trb_u64    left_split;                 /* between the bottom of the stack and what is left of it */
   trbvh_u32  height;
-  struct { trb_u64 split; trbvh_u32 pair; } stack[TRB_OPEN_MAX];   /* subtrees that wait, left children of these pairs */
+  trbvh_u32  end, pairs;                 /* where the block ends; in a block of a final tree, the next pair */
+  struct { trb_u64 split; trbvh_u32 pair, prim, first_pair; } stack[TRB_OPEN_MAX];   /* subtrees that wait */
 } trb_forest;
 
-TRB_SHARED void trb_leave_open(trb_forest *f, trbvh_u32 i) {
-  TRB_GLOBAL trb_open *open = &f->range->open[f->range->open_count++];
-  TRBVH_ASSERT(f->range->open_count <= TRB_OPEN_MAX);
-  open->split = f->stack[i].split;
-  open->pair = f->stack[i].pair;
-  open->node = f->nodes[2 * open->pair];
+/* What trees are built for. Nodes of a final one, all that is known, become what they will be in the result at once:
+ * of a subtree that is better as a leaf no pairs are kept, and the others are numbered in the order in which they are
+ * made, within their block. The result has them in the opposite order (>>collapse). */
+#define TRB_TO_RESTRUCTURE 0
+#define TRB_FINAL_BLOCK    1
+#define TRB_FINAL_TOP      2
+
+/* The node where the i-th subtree of the stack waits: as a left child in its pair; or, where that is not known yet, at
+ * the end of its block, where there is always room: each kept pair has joined two subtrees. */
+TRB_CORE trbvh_u32 trb_waits_at(const trb_forest *f, trbvh_u32 i, int use) {
+  return 2 * (use == TRB_FINAL_BLOCK ? f->end - i : f->stack[i].pair);
 }
 
-/* The next subtree from the left; split is between it and its right neighbour, and has this pair. */
-TRB_CORE void trb_push(trb_forest *f, trbvh_node node, trb_u64 split, trbvh_u32 pair) {
+TRB_CORE void trb_leave_open(trb_forest *f, trbvh_u32 i, trbvh_u32 end_pair, int use) {
+  TRB_GLOBAL trb_open *open = &f->range->open[f->range->open_count++];
+  TRBVH_ASSERT(f->range->open_count <= TRB_OPEN_MAX);
+  open->node = f->nodes[trb_waits_at(f, i, use)];
+  open->split = f->stack[i].split;
+  open->pair = f->stack[i].pair;
+  open->prim = f->stack[i].prim;
+  open->first_pair = f->stack[i].first_pair;
+  open->end_pair = end_pair;
+}
+
+/* The next subtree from the left; split is between it and its right neighbour, and makes this pair. */
+TRB_CORE void trb_push(trb_forest *f, trbvh_node node, trb_u64 split, trbvh_u32 pair, trbvh_u32 prim, int use) {
+  trbvh_u32 first_pair = f->pairs;
   while (f->height && f->stack[f->height - 1].split <= split) {
-    const trbvh_u32 top = --f->height, at = f->stack[top].pair;
+    const trbvh_u32 top = --f->height, left_pair = f->stack[top].first_pair;
     if (top || f->left_split >= f->stack[top].split) {
+      const trbvh_u32 at = use == TRB_FINAL_BLOCK ? f->pairs : f->stack[top].pair;
+      const trbvh_node left = f->nodes[trb_waits_at(f, top, use)];
+      if (use == TRB_FINAL_BLOCK) f->nodes[2 * at] = left;
       f->nodes[2 * at + 1] = node;
-      node = trb_parent(f->nodes[2 * at], node, 2 * at, f->costs);
+      node = trb_parent(left, node, 2 * at, f->costs);
+      if (use != TRB_TO_RESTRUCTURE) {
+        const int leaf = trb_is_leaf(node.count);
+        first_pair = left_pair;
+        node.first = leaf ? prim : node.first;
+        f->pairs = leaf ? first_pair : f->pairs + 1;
+      }
     } else {                             /* the parent of what waited begins left of the block */
       f->left_split = f->stack[top].split;
-      trb_leave_open(f, top);
+      trb_leave_open(f, top, first_pair, use);
     }
   }
   TRBVH_ASSERT(f->height < TRB_OPEN_MAX);
   f->stack[f->height].split = split;
-  f->stack[f->height++].pair = pair;
-  f->nodes[2 * pair] = node;
+  f->stack[f->height].pair = pair;
+  f->stack[f->height].prim = prim;
+  f->stack[f->height].first_pair = first_pair;
+  f->nodes[trb_waits_at(f, f->height++, use)] = node;
 }
 
-/* The subtrees over sorted leaves first..end - 1. */
-TRB_SHARED void trb_build_block(const trb_curve *curve, trbvh_u32 first, trbvh_u32 end, trb_costs costs,
-                                TRB_GLOBAL trbvh_node *nodes, TRB_GLOBAL trb_range *range) {
+TRB_CORE void trb_build_block_for(const trb_curve *curve, trbvh_u32 first, trbvh_u32 end, trb_costs costs,
+                                  TRB_GLOBAL trbvh_node *nodes, TRB_GLOBAL trb_range *range, int use) {
   trbvh_u32 i, n;
   trb_row row;
   trb_forest f;
@@ -1298,30 +1332,46 @@ TRB_SHARED void trb_build_block(const trb_curve *curve, trbvh_u32 first, trbvh_u
   f.costs = costs;
   f.left_split = trb_split_after(curve, first - 1);
   f.height = 0;
+  f.end = end;
+  f.pairs = first + 1;
   range->open_count = 0;
   for (; first < end; first += n) {
     n = TRB_MIN(end - first, TRB_ROW);
     trb_read_leaves(curve, first, n, end, &row);
-    for (i = 0; i < n; i++)
-      trb_push(&f, trb_reference(trb_row_box(&row, i), costs), trb_split_after(curve, first + i),
-               first + i + 1 < curve->count ? first + i + 1 : 0);
+    for (i = 0; i < n; i++) {
+      const trbvh_u32 after = first + i + 1, prim = curve->count - after;
+      trbvh_node node = trb_reference(trb_row_box(&row, i), costs);
+      if (use == TRB_FINAL_BLOCK) node.first = prim;
+      trb_push(&f, node, trb_split_after(curve, first + i), after < curve->count ? after : 0, prim, use);
+    }
   }
-  for (i = 0; i < f.height; i++) trb_leave_open(&f, i);
+  for (i = 0; i < f.height; i++) trb_leave_open(&f, i, i + 1 < f.height ? f.stack[i + 1].first_pair : f.pairs, use);
+  for (i = 0; use == TRB_FINAL_BLOCK && i < range->open_count; i++)      /* pairs that the block has kept free */
+    if (range->open[i].pair) range->open[i].pair = end - (range->open_count - 1 - i);
+}
+
+/* The subtrees over sorted leaves first..end - 1. */
+TRB_SHARED void trb_build_block(const trb_curve *curve, trbvh_u32 first, trbvh_u32 end, trb_costs costs, int final,
+                                TRB_GLOBAL trbvh_node *nodes, TRB_GLOBAL trb_range *range) {
+  if (final) trb_build_block_for(curve, first, end, costs, nodes, range, TRB_FINAL_BLOCK);
+  else trb_build_block_for(curve, first, end, costs, nodes, range, TRB_TO_RESTRUCTURE);
 }
 
 /* The tree above the blocks; its root is nodes[0]. */
 TRB_SHARED void trb_build_top(TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trb_range *ranges, trbvh_u32 blocks,
-                              trb_costs costs) {
+                              trb_costs costs, int final) {
   trbvh_u32 i, k;
   trb_forest f;
   f.nodes = nodes;
   f.range = 0;
   f.costs = costs;
   f.left_split = TRB_NO_SPLIT;
-  f.height = 0;
+  f.height = f.end = f.pairs = 0;
   for (i = 0; i < blocks; i++)
-    for (k = 0; k < ranges[i].open_count; k++)
-      trb_push(&f, ranges[i].open[k].node, ranges[i].open[k].split, ranges[i].open[k].pair);
+    for (k = 0; k < ranges[i].open_count; k++) {
+      const trb_open open = ranges[i].open[k];
+      trb_push(&f, open.node, open.split, open.pair, open.prim, final ? TRB_FINAL_TOP : TRB_TO_RESTRUCTURE);
+    }
   TRBVH_ASSERT(f.height == 1);
 }
 
@@ -1637,10 +1687,14 @@ TRB_SHARED void trb_restructure_top(TRB_GLOBAL trbvh_node *nodes, trb_words word
 
 // >>collapse ---- subtrees that are cheaper as leaves become leaves, and the tree moves into its final layout --------
 /* Every small node knows already whether it is better as a leaf (equation 2, trb_parent); the topmost such nodes
- * become leaves. Subtrees of up to TRB_BLOCK references are tasks. A task's subtree is settled as soon as it has been
- * through its rounds, while it is in a cache: a walk from the root down, right before left, turns nodes into what they
- * will be in the result, and lists them in its order. When all are settled, the result is allocated, prefix sums tell
- * every task its place, and the listed nodes are copied there, without a look at what is in them.
+ * become leaves. The result has parents before children and right before left: a pair of siblings, all that is below
+ * the right one, all that is below the left one; and so have their primitives.
+ *
+ * Subtrees of up to TRB_BLOCK references are tasks. A task's subtree is settled as soon as it has been through its
+ * rounds, while it is in a cache: a walk from the root down turns nodes into what they will be in the result, and lists
+ * them in its order. When all are settled, the result is allocated, prefix sums tell every task its place, and the
+ * listed nodes are copied there, without a look at what is in them. A final tree (>>hierarchy) has nothing to settle:
+ * its pairs have been made in the opposite order, and its primitives are in the opposite order of the keys.
  *
  * The depth bound: a node at depth d with n references can always be made a balanced subtree that ends at depth
  * d + ceil(log2 n). Where a child could no longer be made so within TRBVH_MAX_DEPTH, its parent still can, and is. As
@@ -1651,6 +1705,9 @@ typedef struct trb_collapser {
   trb_costs costs;
   float     cost_node, cost_prim;
   trbvh_u32 split;                       /* not 0: one primitive may have several references */
+  const TRB_GLOBAL trb_u64 *keys;        /* sorted, of a final tree: ref_count, of this form */
+  trb_key_form form;
+  trbvh_u32    ref_count;
   TRB_GLOBAL trbvh_node *out;            /* the result, once it is allocated */
   TRB_GLOBAL trbvh_u32  *prims;
 } trb_collapser;
@@ -1751,33 +1808,52 @@ TRB_CORE void trb_emit_inner(const trb_collapser *c, trbvh_node node, trbvh_u32 
 /* A subtree of TRB_BLOCK references at most: what is known of it, what it came to, and its place in the result. */
 typedef struct trb_task {
   trbvh_u32 node, depth, first_ref;
+  trbvh_u32 end_pair;                    /* of a final tree's pairs */
   trbvh_u32 leaves, prims, max_depth;
   trbvh_u32 dst, pair, first_prim;
   TRB_REAL  sah;
 } trb_task;
-#define TRB_TASKS_MAX(refs) (TRBVH_MAX_DEPTH * ((refs) / TRB_BLOCK) + 1)
+#define TRB_TASKS_MAX(refs) (TRB_OPEN_MAX * ((refs) / TRB_BLOCK + 1))
 
 /* Neighbouring tasks that one job does: a quarter of TRB_BLOCK references or more but for the last one. */
 typedef struct trb_group { trbvh_u32 first_task, tasks; } trb_group;
 #define TRB_GROUPS_MAX(refs) (4 * ((refs) / TRB_BLOCK) + 4)
 
-/* Finds the tasks, returns how many, and sums up equation 1 above them. */
-TRB_CORE trbvh_u32 trb_find_tasks(const trb_collapser *c, TRB_GLOBAL trb_task *tasks, TRB_REAL *sah) {
+/* Finds the tasks, returns how many, and sums up equation 1 above them. Those of a final tree are what its blocks left
+ * open, in these ranges; else there are none. */
+TRB_CORE trbvh_u32 trb_find_tasks(const trb_collapser *c, const TRB_GLOBAL trb_range *range, TRB_GLOBAL trb_task *tasks,
+                                  TRB_REAL *sah) {
   trbvh_u32 stack[TRBVH_MAX_DEPTH + 1], depths[TRBVH_MAX_DEPTH + 1], waiting = 0, refs = 0, node = 0, depth = 0, count = 0;
+  trbvh_u32 next = 0;                                /* of the range's subtrees */
   *sah = 0;
   for (;;) {
     const trbvh_node n = trb_bounded_node(c, node, depth, refs);
-    if (trb_count(n.count) > TRB_BLOCK) {
+    const trbvh_u32 n_refs = trb_count(n.count);
+    const int leaf = trb_is_leaf(n.count);
+    if (range ? !leaf && n_refs > trb_count(range->open[next].node.count) : n_refs > TRB_BLOCK) {
       *sah += trb_sah_term(n, c->cost_node);
       stack[waiting] = n.first + 1;
       depths[waiting++] = ++depth;
       node = n.first;
     } else {
       TRB_GLOBAL trb_task *task = &tasks[count++];
+      trbvh_u32 passed = 0;
       task->node = node;
       task->depth = depth;
       task->first_ref = refs;
-      refs += trb_count(n.count);
+      if (range) {
+        task->prims = n_refs;
+        task->leaves = leaf ? 1 : range->open[next].end_pair - range->open[next].first_pair + 1;
+        task->end_pair = range->open[next].end_pair;
+      }
+      while (range && passed < n_refs) {             /* a leaf may be made of several */
+        passed += trb_count(range->open[next].node.count);
+        if (++next == range->open_count) {
+          next = 0;
+          range++;
+        }
+      }
+      refs += n_refs;
       if (waiting == 0) return count;
       node = stack[--waiting];
       depth = depths[waiting];
@@ -1814,8 +1890,7 @@ TRB_SHARED void trb_restructure_group(const trb_collapser *c, const TRB_GLOBAL t
   }
 }
 
-/* An inner node of the walk: where its children stand, their depth. */
-typedef struct trb_visit { trbvh_u32 first, depth; } trb_visit;
+typedef struct trb_visit { trbvh_u32 node, depth; } trb_visit;
 
 /* The walk runs through memory backwards, as far as treelets have not moved things: asks for the pairs that it will come
  * to 2 TRB_AHEAD references before this one. */
@@ -1828,39 +1903,38 @@ TRB_CORE void trb_prefetch_pairs(const trb_collapser *c, trbvh_u32 ref, trbvh_u3
  * plane, primitives in that of the second one. */
 TRB_SHARED void trb_settle_task(const trb_collapser *c, TRB_GLOBAL trb_task *task) {
   TRB_GLOBAL trbvh_u32 *order = c->words.plane[0] + task->first_ref, *prims = c->words.plane[1] + task->first_ref;
-  trbvh_u32 waiting = 0, child = task->node, siblings = 1, pairs = 0, refs = task->first_ref, prim = 0, max_depth = 0, i;
+  trbvh_u32 waiting = 0, pairs = 0, refs = task->first_ref, prim = 0, max_depth = 0, i;
   trbvh_u32 leaf_prims[TRB_MAX_LEAF];
   const trbvh_u32 last_ref = task->first_ref + trb_count(c->nodes[task->node].count);
   TRB_REAL sah = 0;
   trb_visit stack[TRBVH_MAX_DEPTH + 1], v;
+  v.node = task->node;
   v.depth = task->depth;
   for (;;) {
-    for (; siblings; siblings--, child++) {
-      const trbvh_node node = trb_bounded_node(c, child, v.depth, refs);
-      TRB_GLOBAL trbvh_node *settled = &c->nodes[child];
-      if (trb_is_leaf(node.count)) {
-        const trbvh_u32 count = trb_leaf_prims(c, node, leaf_prims);
-        for (i = 0; i < count; i++) prims[prim + i] = leaf_prims[i];
-        trb_prefetch_pairs(c, last_ref - (refs - task->first_ref), trb_count(node.count));
-        settled->first = prim;
-        settled->count = count;
-        prim += count;
-        refs += trb_count(node.count);
-        sah += trb_sah_term(node, (TRB_REAL)c->cost_prim * count);
-        max_depth = TRB_MAX(v.depth, max_depth);
-      } else {
-        settled->first = pairs;
-        settled->count = 0;
-        order[pairs++] = node.first;
-        sah += trb_sah_term(node, c->cost_node);
-        stack[waiting].first = node.first;
-        stack[waiting++].depth = v.depth + 1;
-      }
+    const trbvh_node node = trb_bounded_node(c, v.node, v.depth, refs);
+    TRB_GLOBAL trbvh_node *settled = &c->nodes[v.node];
+    if (trb_is_leaf(node.count)) {
+      const trbvh_u32 count = trb_leaf_prims(c, node, leaf_prims);
+      for (i = 0; i < count; i++) prims[prim + i] = leaf_prims[i];
+      trb_prefetch_pairs(c, last_ref - (refs - task->first_ref), trb_count(node.count));
+      settled->first = prim;
+      settled->count = count;
+      prim += count;
+      refs += trb_count(node.count);
+      sah += trb_sah_term(node, (TRB_REAL)c->cost_prim * count);
+      max_depth = TRB_MAX(v.depth, max_depth);
+      if (waiting == 0) break;
+      v = stack[--waiting];
+    } else {
+      settled->first = pairs;
+      settled->count = 0;
+      order[pairs++] = node.first;
+      sah += trb_sah_term(node, c->cost_node);
+      v.depth++;
+      v.node = node.first;
+      stack[waiting++] = v;
+      v.node++;
     }
-    if (waiting == 0) break;
-    v = stack[--waiting];
-    child = v.first;
-    siblings = 2;
   }
   task->leaves = pairs + 1;
   task->prims = prim;
@@ -1874,22 +1948,23 @@ TRB_SHARED void trb_settle_group(const trb_collapser *c, TRB_GLOBAL trb_task *ta
 }
 
 /* Writes the nodes above the tasks, and tells them their places. */
-TRB_SHARED void trb_emit_top(const trb_collapser *c, TRB_GLOBAL trb_task *task) {
+TRB_SHARED void trb_emit_top(const trb_collapser *c, TRB_GLOBAL trb_task *tasks, trbvh_u32 count) {
   trbvh_u32 stack[TRBVH_MAX_DEPTH + 1], dsts[TRBVH_MAX_DEPTH + 1], waiting = 0, pair = 1, prim = 0, node = 0, dst = 0;
   for (;;) {
-    const trbvh_node n = c->nodes[node];
-    if (node != task->node) {
+    if (node != tasks[count - 1].node) {
+      const trbvh_node n = c->nodes[node];
       trb_emit_inner(c, n, dst, pair);
-      stack[waiting] = n.first + 1;
-      dsts[waiting++] = 2 * pair + 1;
-      node = n.first;
-      dst = 2 * pair++;
+      stack[waiting] = n.first;
+      dsts[waiting++] = 2 * pair;
+      node = n.first + 1;
+      dst = 2 * pair++ + 1;
     } else {
+      TRB_GLOBAL trb_task *task = &tasks[--count];
       task->dst = dst;
       task->pair = pair;
       task->first_prim = prim;
       pair += task->leaves - 1;
-      prim += task++->prims;
+      prim += task->prims;
       if (waiting == 0) return;
       node = stack[--waiting];
       dst = dsts[waiting];
@@ -1915,6 +1990,39 @@ TRB_SHARED void trb_emit_task(const trb_collapser *c, trb_task task) {
     trb_emit_settled(c, &task, order[i] + 1, 2 * (task.pair + i) + 1);
   }
   for (i = 0; i < task.prims; i++) c->prims[task.first_prim + i] = prims[i];
+}
+
+/* The same in a final tree, where pairs stand in the opposite order, by the numbers that they have there. */
+TRB_CORE trbvh_node trb_final_node(const trb_task *task, trbvh_node node) {
+  const int leaf = trb_is_leaf(node.count);
+  node.first = leaf ? node.first : 2 * (task->pair + task->end_pair - 1 - node.first / 2);
+  node.count = leaf ? trb_count(node.count) : 0;
+  return node;
+}
+
+TRB_SHARED void trb_emit_final_task(const trb_collapser *c, TRB_GLOBAL trb_task *task) {
+  TRB_GLOBAL trbvh_u32 *depths = c->words.plane[2];  /* of pairs */
+  const trb_task t = *task;
+  trbvh_u32 max_depth = t.depth, i, side;
+  const trbvh_node root = c->nodes[t.node];
+  TRB_REAL sah = trb_sah_term(root, t.leaves > 1 ? c->cost_node : c->cost_prim * (float)t.prims);
+  c->out[t.dst] = trb_final_node(&t, root);
+  if (t.leaves > 1) depths[t.end_pair - 1] = t.depth + 1;
+  for (i = 0; i < t.leaves - 1; i++) {
+    const trbvh_u32 pair = t.end_pair - 1 - i, depth = depths[pair];
+    max_depth = TRB_MAX(depth, max_depth);
+    for (side = 0; side < 2; side++) {
+      const trbvh_node node = c->nodes[2 * pair + side];
+      const int leaf = trb_is_leaf(node.count);
+      sah += trb_sah_term(node, leaf ? c->cost_prim * (float)trb_count(node.count) : c->cost_node);
+      depths[leaf ? pair : node.first / 2] = depth + 1;                  /* a leaf's goes nowhere */
+      c->out[2 * (t.pair + i) + side] = trb_final_node(&t, node);
+    }
+  }
+  task->sah = sah;
+  task->max_depth = max_depth;
+  for (i = t.first_prim; i < t.first_prim + t.prims; i++)
+    c->prims[i] = trb_key_ref(c->keys[c->ref_count - 1 - i], c->form);
 }
 #endif
 
@@ -2187,11 +2295,11 @@ typedef struct trb_wait { trbvh_u32 first, last; } trb_wait;
 typedef struct trb_level { trbvh_u32 first, count; } trb_level;
 
 /* Of an inner node, by the number of its children's pair: inner nodes, primitives and equation 1 from it downwards; then
- * the pair its children get in the result, and the next pair and primitive for what is below. */
+ * the pair its children get in the result, and the first primitive below it. */
 typedef struct trb_place {
   trbvh_u32 inner, prims;
   float     sah;
-  trbvh_u32 pair, next, prim;
+  trbvh_u32 pair, prim;
 } trb_place;
 
 #ifndef TRBVH_OPENCL_C
@@ -2478,18 +2586,19 @@ typedef struct trb_build {
   trb_costs             costs;
   trb_grid              grid;
   uint32_t              ref_max, ref_count, split_max;
+  int                   final;           /* the hierarchy's topology is the result's */
   /* scratch memory; what stands on one line shares it, one after the other */
   void                 *scratch;
   size_t                scratch_size;
   trbvh_node           *refs;            /* ref_max, where there are splits, else NULL */
   trb_u64              *keys, *sorted;   /* ref_max each */                      float *priorities;
-  trbvh_node           *nodes;           /* 2 * ref_max */                       trbvh_node *unsplit;   /* like refs */
+  trbvh_node           *nodes;           /* 2 * ref_max + 2 */                   trbvh_node *unsplit;   /* like refs */
   trb_block            *blocks;
   uint32_t             *histograms;
   trb_range            *ranges;
   trb_group            *groups;
   trb_task             *tasks;
-  uint32_t              block_count, task_count;
+  uint32_t              block_count, task_count, group_count;
   double                sah;             /* equation 1's sum above the tasks */
   /* parameters of the jobs at work */
   float                 priority_unit;
@@ -2600,6 +2709,9 @@ static trbvh_result trb_resolve_size(trb_build *b) {
   b->split_max = (uint32_t)extra;
   b->ref_max = (uint32_t)refs;
   b->key_form = trb_choose_keys(b->ref_max);
+  /* Neither restructured, nor looked through for a primitive's second reference, nor too deep: packed keys differ in
+   * fewer bits than TRBVH_MAX_DEPTH. */
+  b->final = b->options.treelet_rounds == 0 && b->split_max == 0 && b->key_form.packed;
   return TRBVH_OK;
 }
 
@@ -2624,7 +2736,7 @@ static size_t trb_lay_out(trb_build *b, char *base) {
   TRB_PART(refs,       trbvh_node, b->split_max ? n * TRB_NODE_BYTES : 0)
   TRB_PART(keys,       trb_u64,    n * 8)
   TRB_PART(sorted,     trb_u64,    n * 8)
-  TRB_PART(nodes,      trbvh_node, n * 2 * TRB_NODE_BYTES)
+  TRB_PART(nodes,      trbvh_node, (n * 2 + 2) * TRB_NODE_BYTES)
   TRB_PART(blocks,     trb_block,  blocks * sizeof(trb_block))
   TRB_PART(ranges,     trb_range,  blocks * sizeof(trb_range))
   TRB_PART(groups,     trb_group,  TRB_GROUPS_MAX(n) * sizeof(trb_group))
@@ -2946,13 +3058,13 @@ static void trb_hierarchy_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
   const uint32_t first = index * TRB_BLOCK, end = TRB_MIN(b->ref_count, first + TRB_BLOCK);
   const trb_curve curve = trb_sorted_curve(b);
-  trb_build_block(&curve, first, end, b->costs, b->nodes, &b->ranges[index]);
+  trb_build_block(&curve, first, end, b->costs, b->final, b->nodes, &b->ranges[index]);
 }
 
 static trbvh_result trb_build_hierarchy(trb_build *b) {
   const uint32_t blocks = trb_blocks(b->ref_count, TRB_BLOCK);
   if (trb_run(&b->runner, blocks, trb_hierarchy_job, b)) return TRBVH_CANCELLED;
-  trb_build_top(b->nodes, b->ranges, blocks, b->costs);
+  trb_build_top(b->nodes, b->ranges, blocks, b->costs, b->final);
   return TRBVH_OK;
 }
 
@@ -2965,6 +3077,9 @@ static trb_collapser trb_start_collapse(const trb_build *b) {
   c.cost_node = b->options.cost_node;
   c.cost_prim = b->options.cost_prim;
   c.split = b->split_max != 0;
+  c.keys = b->keys;
+  c.form = b->key_form;
+  c.ref_count = b->ref_count;
   c.out = (trbvh_node *)(uintptr_t)b->tree.nodes;
   c.prims = (uint32_t *)(uintptr_t)b->tree.prims;
   return c;
@@ -2979,18 +3094,23 @@ static void trb_group_job(void *context, uint32_t index) {
 
 static trbvh_result trb_restructure_and_settle(trb_build *b) {
   const trb_collapser c = trb_start_collapse(b);
-  uint32_t groups;
   trb_restructure_top(b->nodes, c.words, (uint32_t)b->options.treelet_rounds, b->costs);
-  b->task_count = trb_find_tasks(&c, b->tasks, &b->sah);
-  groups = trb_find_groups(b->tasks, b->task_count, b->groups);
-  return trb_run(&b->runner, groups, trb_group_job, b) ? TRBVH_CANCELLED : TRBVH_OK;
+  b->task_count = trb_find_tasks(&c, b->final ? b->ranges : NULL, b->tasks, &b->sah);
+  b->group_count = trb_find_groups(b->tasks, b->task_count, b->groups);
+  if (b->final) return TRBVH_OK;
+  return trb_run(&b->runner, b->group_count, trb_group_job, b) ? TRBVH_CANCELLED : TRBVH_OK;
 }
 
 // ---- The result ----
 static void trb_emit_job(void *context, uint32_t index) {
   const trb_build *b = (const trb_build *)context;
   const trb_collapser c = trb_start_collapse(b);
-  trb_emit_task(&c, b->tasks[index]);
+  const trb_group group = b->groups[index];
+  uint32_t i;
+  for (i = group.first_task; i < group.first_task + group.tasks; i++) {
+    if (b->final) trb_emit_final_task(&c, &b->tasks[i]);
+    else trb_emit_task(&c, b->tasks[i]);
+  }
 }
 
 /* Memory for the result: the old block where it is large enough, else a new one. */
@@ -3031,16 +3151,19 @@ static trbvh_result trb_emit(trb_build *b, trbvh *bvh) {
   for (i = 0; i < b->task_count; i++) {
     leaves += b->tasks[i].leaves;
     prims += b->tasks[i].prims;
-    sah += b->tasks[i].sah;
-    b->stats.max_depth = TRB_MAX(b->tasks[i].max_depth, b->stats.max_depth);
   }
-  b->stats.sah_cost = root > 0 ? sah / root : 0;
   result = trb_make_room(b, bvh, leaves, prims);
   if (result) return result;
   c = trb_start_collapse(b);
   memset(&c.out[1], 0, TRB_NODE_BYTES);
-  trb_emit_top(&c, b->tasks);
-  return trb_run(&b->runner, b->task_count, trb_emit_job, b) ? TRBVH_CANCELLED : TRBVH_OK;
+  trb_emit_top(&c, b->tasks, b->task_count);
+  if (trb_run(&b->runner, b->group_count, trb_emit_job, b)) return TRBVH_CANCELLED;
+  for (i = 0; i < b->task_count; i++) {
+    sah += b->tasks[i].sah;
+    b->stats.max_depth = TRB_MAX(b->tasks[i].max_depth, b->stats.max_depth);
+  }
+  b->stats.sah_cost = root > 0 ? sah / root : 0;
+  return TRBVH_OK;
 }
 
 // ---- Triangles ----

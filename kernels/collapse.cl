@@ -14,7 +14,7 @@ TRB_KERNEL trb_k_find_tasks(__global trb_plan *plan, __global trbvh_node *nodes,
   const trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);
   float sah = 0;
   if (TRB_LOCAL_ID != 0) return;
-  plan->tasks = plan->ref_count ? trb_find_tasks(&c, tasks, &sah) : 0;
+  plan->tasks = plan->ref_count ? trb_find_tasks(&c, 0, tasks, &sah) : 0;
   plan->groups = trb_find_groups(tasks, plan->tasks, groups);
   plan->sah = sah;
   plan->root_area = trb_sah_term(nodes[0], 1);
@@ -47,7 +47,7 @@ TRB_KERNEL trb_k_emit_top(const __global trb_plan *plan, __global trbvh_node *no
                           __global ulong *sorted, __global trb_task *tasks, __global trbvh_node *out, __global uint *prims) {
   const trb_collapser c = trb_plan_emitter(plan, nodes, keys, sorted, out, prims);
   trb_emit_padding(out);
-  trb_emit_top(&c, tasks);
+  trb_emit_top(&c, tasks, plan->tasks);
 }
 
 TRB_KERNEL trb_k_emit_tasks(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
@@ -134,7 +134,7 @@ static void trb_count_inner(const trb_collapser *c, __global trb_place *places, 
   trb_place sum;
   uint side;
   sum.inner = 1;
-  sum.prims = sum.pair = sum.next = sum.prim = 0;
+  sum.prims = sum.pair = sum.prim = 0;
   sum.sah = trb_sah_term(node, c->cost_node);
   for (side = 0; side < 2; side++) {
     const trbvh_node child = c->nodes[node.first + side];
@@ -194,44 +194,29 @@ TRB_KERNEL trb_k_sum_inner(__global trb_plan *plan, __global trbvh_node *nodes, 
     plan->sah = root->sah;
     plan->max_depth = depth;
     root->pair = 1;
-    root->next = 2;
     root->prim = 0;
   }
 }
 
-/* Where an inner node's children go, and what is below them: the order of trb_emit_top and trb_emit_task. */
+/* Where an inner node's children go: what is below them follows, right before left. */
 static void trb_place_children(const trb_collapser *c, __global trb_place *places, uint index) {
   const trbvh_node node = c->nodes[index];
   const trb_place place = places[node.first / 2];
-  const int top = trb_count(node.count) > TRB_BLOCK;
-  trbvh_node child[2];
-  uint next = place.next, p = place.prim, side;
-  trb_place below[2];
-  for (side = 0; side < 2; side++) {                 /* the children themselves: left before right */
-    child[side] = c->nodes[node.first + side];
-    if (trb_is_leaf(child[side].count)) {
-      p += trb_emit_leaf(c, child[side], 2 * place.pair + side, p);
+  uint pair = place.pair + 1, prim = place.prim, side;
+  for (side = 2; side-- > 0;) {
+    const trbvh_node child = c->nodes[node.first + side];
+    const uint dst = 2 * place.pair + side;
+    if (trb_is_leaf(child.count)) {
+      prim += trb_emit_leaf(c, child, dst, prim);
     } else {
-      below[side] = places[child[side].first / 2];
-      below[side].pair = next++;
-      trb_emit_inner(c, child[side], 2 * place.pair + side, below[side].pair);
-      if (top) {                                     /* above the tasks, each with all that is below it */
-        below[side].next = next;
-        below[side].prim = p;
-        next += below[side].inner - 1;
-        p += below[side].prims;
-      }
+      __global trb_place *below = &places[child.first / 2];
+      trb_emit_inner(c, child, dst, pair);
+      below->pair = pair;
+      below->prim = prim;
+      pair += below->inner;
+      prim += below->prims;
     }
   }
-  for (side = 2; side-- > 0 && !top;)                /* within a task, what is below: right before left */
-    if (!trb_is_leaf(child[side].count)) {
-      below[side].next = next;
-      below[side].prim = p;
-      next += below[side].inner - 1;
-      p += below[side].prims;
-    }
-  for (side = 0; side < 2; side++)
-    if (!trb_is_leaf(child[side].count)) places[child[side].first / 2] = below[side];
 }
 
 TRB_KERNEL trb_k_emit_root(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *out,

@@ -18,12 +18,12 @@ TRB_KERNEL trb_k_build_blocks(const __global trb_plan *plan, const __global ulon
   const uint blocks = curve.count ? (curve.count - 1) / TRB_BLOCK + 1 : 0;
   uint i;
   TRB_FOR_JOBS(i, blocks)
-    trb_build_block(&curve, i * TRB_BLOCK, min(curve.count, (i + 1) * TRB_BLOCK), plan->costs, nodes, &ranges[i]);
+    trb_build_block(&curve, i * TRB_BLOCK, min(curve.count, (i + 1) * TRB_BLOCK), plan->costs, 0, nodes, &ranges[i]);
 }
 
 TRB_KERNEL trb_k_build_top(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_range *ranges) {
   const uint count = plan->ref_count;
-  if (count) trb_build_top(nodes, ranges, (count - 1) / TRB_BLOCK + 1, plan->costs);
+  if (count) trb_build_top(nodes, ranges, (count - 1) / TRB_BLOCK + 1, plan->costs, 0);
 }
 #else
 /* Split i is what splits sorted leaf i from leaf i + 1. The node that it makes covers the leaves around it up to the

@@ -378,6 +378,7 @@ static void make_keys(trb_build *b, const trbvh_geometry *g, const trbvh_options
 }
 static void build_hierarchy(trb_build *b, const trbvh_geometry *g, const trbvh_options *o) {
   make_keys(b, g, o);
+  b->final = 0;                                     /* all nodes are to be seen, also below leaves */
   CHECK(trb_sort_keys(b) == TRBVH_OK && trb_build_hierarchy(b) == TRBVH_OK);
 }
 
@@ -867,7 +868,7 @@ static void all_rounds(trb_build *b) {
   const uint32_t rounds = (uint32_t)b->options.treelet_rounds;
   uint32_t groups, i;
   trb_restructure_top(b->nodes, c.words, rounds, b->costs);
-  b->task_count = trb_find_tasks(&c, b->tasks, &b->sah);
+  b->task_count = trb_find_tasks(&c, NULL, b->tasks, &b->sah);
   groups = trb_find_groups(b->tasks, b->task_count, b->groups);
   CHECK(groups <= TRB_GROUPS_MAX(b->ref_count) && b->task_count <= TRB_TASKS_MAX(b->ref_count));
   for (i = groups; i > 0; i--) trb_restructure_group(&c, b->tasks, b->groups[i - 1], rounds);
@@ -892,7 +893,7 @@ static void test_rounds(void) {
       trb_build b;
       trbvh_geometry g;
       trbvh_options o;
-      if (kind >= 4 && rounds[i] != 3) continue;
+      if (kind >= 4 && rounds[i] != 3 && rounds[i] > 0) continue;
       count = kind == 2 ? 1000 + i : BOXES;
       CONTEXT("kind %u, %d rounds", kind, rounds[i]);
       memset(&bvh, 0, sizeof bvh);
@@ -920,6 +921,60 @@ static void test_rounds(void) {
     }
   free(boxes);
   free(nodes);
+  free(memory);
+}
+
+// >>final trees
+/* A tree that is final as it is made, and the same one settled afterwards. */
+static void test_final_trees(void) {
+  static const uint32_t counts[] = {1, 2, 3, 9, 64, 1000, TRB_BLOCK - 1, TRB_BLOCK, TRB_BLOCK + 1, 2 * TRB_BLOCK + 3,
+                                    QUICK_OR(3, 9) * TRB_BLOCK + 77};
+  static const uint32_t leaves[] = {1, 3, 8, 16};
+  const uint32_t most = counts[sizeof counts / sizeof counts[0] - 1];
+  trbvh_node *boxes = (trbvh_node *)xmalloc(most * sizeof *boxes);
+  float *memory = (float *)xmalloc((size_t)most * 24);
+  uint32_t c, kind, k;
+  for (c = 0; c < sizeof counts / sizeof counts[0]; c++)
+    for (kind = 0; kind < 4 + HOLES; kind++)
+      for (k = 0; k < 4; k++) {
+        const uint32_t n = counts[c];
+        trbvh_options o;
+        trbvh_geometry g;
+        trbvh_stats stats;
+        trb_build b;
+        trbvh want, got;
+        if (n > TRB_BLOCK && (k + kind + c) % 4) continue;
+        CONTEXT("%u boxes, kind %u, leaves of %u", n, kind, leaves[k]);
+        memset(&want, 0, sizeof want);
+        memset(&got, 0, sizeof got);
+        memset(&o, 0, sizeof o);
+        o.quality = TRBVH_QUALITY_FAST;
+        o.max_leaf = leaves[k];
+        some_boxes(boxes, n, kind < 4 ? kind : 0);
+        if (kind >= 4) make_holes(boxes, n, kind - 4);
+        g = geometry_of_boxes(boxes, n, memory);
+        o.stats = &stats;
+        CHECK(trbvh_build(&got, &g, &o) == TRBVH_OK);
+        o.stats = NULL;
+        begin_build(&b, &g, &o);
+        CHECK(b.final && trb_read(&b) == TRBVH_OK);
+        CHECK(stats.ref_count == b.ref_count);
+        if (b.ref_count) {
+          b.final = 0;
+          CHECK(!trb_make_keys(&b) && trb_sort_keys(&b) == TRBVH_OK && trb_build_hierarchy(&b) == TRBVH_OK);
+          CHECK(trb_restructure_and_settle(&b) == TRBVH_OK && trb_emit(&b, &want) == TRBVH_OK);
+          trb_hand_over(&b, &want, n);
+          CHECK(want.node_count == got.node_count && want.ref_count == got.ref_count);
+          CHECK(want.node_count == got.node_count && !memcmp(want.nodes, got.nodes, want.node_count * sizeof *want.nodes));
+          CHECK(want.ref_count == got.ref_count && !memcmp(want.prims, got.prims, 4 * (size_t)want.ref_count));
+          CHECK_MSG(stats.max_depth == b.stats.max_depth && fabs(stats.sah_cost - b.stats.sah_cost) <= 1e-6 * b.stats.sah_cost,
+                    "depth %u and %u, SAH %g and %g", stats.max_depth, b.stats.max_depth, stats.sah_cost, b.stats.sah_cost);
+        }
+        end_build(&b);
+        trbvh_free(&want);
+        trbvh_free(&got);
+      }
+  free(boxes);
   free(memory);
 }
 
@@ -1194,6 +1249,7 @@ int main(int argc, char **argv) {
   RUN(test_treelet_of_a_root);
   RUN(test_rounds);
   RUN(test_balance);
+  RUN(test_final_trees);
   RUN(test_depth_bound);
   RUN(test_fragments);
   RUN(test_split_budget);
