@@ -2587,6 +2587,7 @@ typedef struct trb_build {
   trb_grid              grid;
   uint32_t              ref_max, ref_count, split_max;
   int                   final;           /* the hierarchy's topology is the result's */
+  int                   guessed;         /* trb_read has made the keys */
   /* scratch memory; what stands on one line shares it, one after the other */
   void                 *scratch;
   size_t                scratch_size;
@@ -2761,10 +2762,57 @@ TRBVH_API size_t trbvh_bytes_bound(const trbvh_geometry *geometry, const trbvh_o
   return fits ? trb_result_size(&b, b.ref_max, b.ref_max) : 0;
 }
 
-/* A block's bounds, and where they are to be kept its references, with gaps for invalid primitives. */
+/* Keys of a whole row, filled or not. */
+TRB_CORE void trb_make_row_keys(const trb_row *row, uint32_t first, trb_grid grid, trb_key_form form, trb_u64 key[TRB_ROW]) {
+  uint32_t i;
+  for (i = 0; i < TRB_ROW; i++) {
+    float x = 0.5f * row->min[0][i] + 0.5f * row->max[0][i], y = 0.5f * row->min[1][i] + 0.5f * row->max[1][i];
+    float z = 0.5f * row->min[2][i] + 0.5f * row->max[2][i];
+    key[i] = trb_key(trb_morton(x, y, z, grid), first + i, form, 0);
+  }
+}
+
+#ifdef TRB_AVX
+TRB_TARGET("avx2") static void trb_row_keys_avx2(const trb_row *row, uint32_t first, trb_grid grid, trb_key_form form,
+                                       trb_u64 key[TRB_ROW]) {
+  trb_make_row_keys(row, first, grid, form, key);
+}
+#endif
+
+static void trb_row_keys(const trb_row *row, uint32_t first, trb_grid grid, trb_key_form form, trb_u64 key[TRB_ROW]) {
+#ifdef TRB_AVX
+  if (trb_simd() >= 256) {
+    trb_row_keys_avx2(row, first, grid, form, key);
+    return;
+  }
+#endif
+  trb_make_row_keys(row, first, grid, form, key);
+}
+
+/* The bounds of some positions, used or not. */
+static void trb_guess_job(void *context, uint32_t index) {
+  trb_build *b = (trb_build *)context;
+  const uint32_t part = trb_blocks(b->input.position_count, b->block_count);
+  uint32_t i = TRB_MIN(b->input.position_count, index * part), end = TRB_MIN(b->input.position_count - i, part) + i;
+  const char *p = trb_position(&b->input, i);
+  const size_t stride = b->input.position_stride;
+  float low[3] = {FLT_MAX, FLT_MAX, FLT_MAX}, high[3] = {-FLT_MAX, -FLT_MAX, -FLT_MAX}, v[3];
+  for (; i < end; i++, p += stride) {
+    trb_load_position(v, p);
+    #define TRB_AXIS(k) low[k] = TRB_MIN(v[k], low[k]); high[k] = TRB_MAX(v[k], high[k]);
+    TRB_AXIS(0) TRB_AXIS(1) TRB_AXIS(2)
+    #undef TRB_AXIS
+  }
+  b->blocks[index].bounds = trb_no_box();
+  trb_include(&b->blocks[index].bounds, low, high);
+}
+
+/* A block's bounds, and where they are to be kept its references, with gaps for invalid primitives; or keys, in case the
+ * guess is right. */
 static void trb_read_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
   uint32_t first = index * TRB_BLOCK, end = TRB_MIN(b->input.count, first + TRB_BLOCK), i, k, n, good, vertex;
+  trb_u64 key[TRB_ROW];
   trb_block block;
   trb_row row, all;
   float v[3][3];
@@ -2787,6 +2835,10 @@ static void trb_read_job(void *context, uint32_t index) {
         all.min[k][i] = TRB_MIN(row.min[k][i], all.min[k][i]);
         all.max[k][i] = TRB_MAX(row.max[k][i], all.max[k][i]);
       }
+    if (b->guessed) {
+      trb_row_keys(&row, first, b->grid, b->key_form, key);
+      memcpy(b->keys + first, key, n * sizeof *key);
+    }
     for (i = 0; b->unsplit && i < good; i++) {
       b->unsplit[first + i] = trb_row_box(&row, i);
       if (!row.valid[i]) b->unsplit[first + i].first = TRBVH_NONE;
@@ -2806,11 +2858,28 @@ static void trb_read_job(void *context, uint32_t index) {
   b->blocks[index] = block;
 }
 
-/* The scene's bounds. Fails for an index out of range. */
-static trbvh_result trb_read(trb_build *b) {
+static trbvh_node trb_sum_bounds(const trb_build *b) {
   trbvh_node bounds = trb_no_box();
   uint32_t i;
+  for (i = 0; i < b->block_count; i++) trb_include(&bounds, b->blocks[i].bounds.min, b->blocks[i].bounds.max);
+  return bounds;
+}
+
+/* The scene's bounds. Fails for an index out of range.
+ *
+ * Codes need the bounds first, and so a second look at all triangles. Most meshes use all of their positions, which are
+ * looked through sooner: codes are made with their bounds at once, and kept where those turn out to be the triangles'. */
+static trbvh_result trb_read(trb_build *b) {
+  trbvh_node guess = trb_no_box(), bounds;
+  uint32_t i;
+  int k, equal = 1;
   b->block_count = trb_blocks(b->input.count, TRB_BLOCK);
+  b->guessed = b->input.indices && b->input.position_count <= b->input.count && !b->split_max;
+  if (b->guessed) {
+    if (trb_run(&b->runner, b->block_count, trb_guess_job, b)) return TRBVH_CANCELLED;
+    guess = trb_sum_bounds(b);
+    b->grid = trb_make_grid(guess);
+  }
   if (trb_run(&b->runner, b->block_count, trb_read_job, b)) return TRBVH_CANCELLED;
   for (i = 0; i < b->block_count; i++) {
     trb_block *block = &b->blocks[i];
@@ -2819,8 +2888,10 @@ static trbvh_result trb_read(trb_build *b) {
                       block->bad_vertex, b->input.position_count);
     b->stats.skipped_count += block->skipped;
     b->ref_count += block->refs;
-    trb_include(&bounds, block->bounds.min, block->bounds.max);
   }
+  bounds = trb_sum_bounds(b);
+  for (k = 0; k < 3; k++) equal &= bounds.min[k] == guess.min[k] && bounds.max[k] == guess.max[k];
+  b->guessed = b->guessed && equal && b->ref_count == b->input.count;
   b->grid = trb_make_grid(bounds);
   return TRBVH_OK;
 }
@@ -2936,33 +3007,6 @@ static void trb_gather_row(const trbvh_node *refs, uint32_t count, trb_row *row)
   }
 }
 
-/* Keys of a whole row, filled or not. */
-TRB_CORE void trb_make_row_keys(const trb_row *row, uint32_t first, trb_grid grid, trb_key_form form, trb_u64 key[TRB_ROW]) {
-  uint32_t i;
-  for (i = 0; i < TRB_ROW; i++) {
-    float x = 0.5f * row->min[0][i] + 0.5f * row->max[0][i], y = 0.5f * row->min[1][i] + 0.5f * row->max[1][i];
-    float z = 0.5f * row->min[2][i] + 0.5f * row->max[2][i];
-    key[i] = trb_key(trb_morton(x, y, z, grid), first + i, form, 0);
-  }
-}
-
-#ifdef TRB_AVX
-TRB_TARGET("avx2") static void trb_row_keys_avx2(const trb_row *row, uint32_t first, trb_grid grid, trb_key_form form,
-                                       trb_u64 key[TRB_ROW]) {
-  trb_make_row_keys(row, first, grid, form, key);
-}
-#endif
-
-static void trb_row_keys(const trb_row *row, uint32_t first, trb_grid grid, trb_key_form form, trb_u64 key[TRB_ROW]) {
-#ifdef TRB_AVX
-  if (trb_simd() >= 256) {
-    trb_row_keys_avx2(row, first, grid, form, key);
-    return;
-  }
-#endif
-  trb_make_row_keys(row, first, grid, form, key);
-}
-
 /* Keys of a block's references, without the gaps. */
 static void trb_key_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
@@ -2984,6 +3028,7 @@ static void trb_key_job(void *context, uint32_t index) {
 
 static int trb_make_keys(trb_build *b) {
   uint32_t i, start = 0;
+  if (b->guessed) return 0;
   for (i = 0; i < b->block_count; i++) {
     b->blocks[i].key_start = start;
     start += b->blocks[i].refs;

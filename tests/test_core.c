@@ -924,6 +924,63 @@ static void test_rounds(void) {
   free(memory);
 }
 
+// >>the guessed grid
+/* Bounds of all positions are the triangles' or they are not: the tree is that of the same triangles without indices. */
+static void test_guessed_grid(void) {
+  enum { SIDE = 130, COUNT = 2 * (SIDE - 1) * (SIDE - 1), POSITIONS = SIDE * SIDE + 1 };     /* the last is not used */
+  const size_t bytes = (size_t)POSITIONS * 20;
+  char *positions = (char *)xmalloc(bytes);
+  uint32_t *indices = (uint32_t *)xmalloc((size_t)COUNT * 3 * sizeof *indices), kind, i, at = 0;
+  float *soup = (float *)xmalloc((size_t)COUNT * 36), bad = 0;
+  memset(positions, 0, bytes);
+  for (i = 0; i < COUNT / 2; i++) {
+    const uint32_t v = i / (SIDE - 1) * SIDE + i % (SIDE - 1);
+    indices[at++] = v;        indices[at++] = v + 1;    indices[at++] = v + SIDE;
+    indices[at++] = v + SIDE; indices[at++] = v + 1;    indices[at++] = v + SIDE + 1;
+  }
+  for (kind = 0; kind < 6; kind++) {
+    trb_build b;
+    trbvh_geometry g, plain;
+    trbvh indexed, want;
+    rng r = {11};
+    CONTEXT("kind %u", kind);
+    memset(&indexed, 0, sizeof indexed);
+    memset(&want, 0, sizeof want);
+    memset(&g, 0, sizeof g);
+    for (i = 0; i < POSITIONS; i++) {
+      const float p[3] = {(float)(i % SIDE), rng_range(&r, -3, 3), (float)(i / SIDE) * (i == POSITIONS - 1 ? 0.5f : 1)};
+      memcpy(positions + 20 * (size_t)i, p, 12);
+    }
+    if (kind == 1) bad = -3.1f;
+    if (kind == 2) bad = 1e30f;
+    if (kind == 3) bad = trb_float(0x7FC00000u);
+    if (kind == 4) bad = trb_float(0xFF800000u);
+    if (kind > 0 && kind < 5) memcpy(positions + 20 * (size_t)(POSITIONS - 1) + 4, &bad, 4);
+    if (kind == 5) memcpy(positions + 20 * 700, &bad, 4);                /* infinite, and used */
+    for (i = 0; i < COUNT * 3; i++) memcpy(soup + 3 * i, positions + 20 * (size_t)indices[i], 12);
+    g.positions = (const float *)(const void *)positions;
+    g.position_stride = 20;
+    g.position_count = POSITIONS;
+    g.indices = indices;
+    g.count = COUNT;
+    begin_build(&b, &g, NULL);
+    CHECK(trb_read(&b) == TRBVH_OK);
+    CHECK_MSG(b.guessed == (kind == 0 || kind == 3), "%d", b.guessed);   /* a NaN is not seen */
+    end_build(&b);
+    plain = geometry_of_soup(soup, COUNT);
+    CHECK(trbvh_build(&indexed, &g, NULL) == TRBVH_OK && trbvh_build(&want, &plain, NULL) == TRBVH_OK);
+    CHECK(indexed.node_count == want.node_count && indexed.ref_count == want.ref_count);
+    CHECK(indexed.node_count == want.node_count &&
+          !memcmp(indexed.nodes, want.nodes, want.node_count * sizeof *want.nodes));
+    CHECK(indexed.ref_count == want.ref_count && !memcmp(indexed.prims, want.prims, 4 * (size_t)want.ref_count));
+    trbvh_free(&indexed);
+    trbvh_free(&want);
+  }
+  free(positions);
+  free(indices);
+  free(soup);
+}
+
 // >>final trees
 /* A tree that is final as it is made, and the same one settled afterwards. */
 static void test_final_trees(void) {
@@ -1249,6 +1306,7 @@ int main(int argc, char **argv) {
   RUN(test_treelet_of_a_root);
   RUN(test_rounds);
   RUN(test_balance);
+  RUN(test_guessed_grid);
   RUN(test_final_trees);
   RUN(test_depth_bound);
   RUN(test_fragments);
