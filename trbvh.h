@@ -1184,6 +1184,7 @@ TRB_SHARED void trb_place_digits(TRB_GLOBAL trbvh_u32 *histograms, trbvh_u32 blo
  * a cache line whose place is known before its nodes are, and subtrees that are contiguous in memory. */
 #define TRB_BLOCK    16384u              /* primitives, references or leaves a job works on: their nodes fit a cache */
 #define TRB_TOP      1024u               /* nodes of more references are the top of the tree */
+#define TRB_NEAR     98304u              /* so few primitives are in a cache when they are read again */
 #define TRB_OPEN_MAX 200u                /* subtrees of a block that its neighbours complete: 2 (63 + 32) + 1 at most */
 #define TRB_NO_SPLIT (~(trb_u64)0)       /* shallower than any: the end of the scene */
 
@@ -1337,7 +1338,7 @@ TRB_CORE void trb_build_block_for(const trb_curve *curve, trbvh_u32 first, trbvh
   range->open_count = 0;
   for (; first < end; first += n) {
     n = TRB_MIN(end - first, TRB_ROW);
-    trb_read_leaves(curve, first, n, end, &row);
+    trb_read_leaves(curve, first, n, curve->count > TRB_NEAR ? end : first + n, &row);
     for (i = 0; i < n; i++) {
       const trbvh_u32 after = first + i + 1, prim = curve->count - after;
       trbvh_node node = trb_reference(trb_row_box(&row, i), costs);
@@ -2773,18 +2774,21 @@ TRB_CORE void trb_make_row_keys(const trb_row *row, uint32_t first, trb_grid gri
 }
 
 #ifdef TRB_AVX
-TRB_TARGET("avx2") static void trb_row_keys_avx2(const trb_row *row, uint32_t first, trb_grid grid, trb_key_form form,
-                                       trb_u64 key[TRB_ROW]) {
-  trb_make_row_keys(row, first, grid, form, key);
-}
+  #define TRB_ROW_KEYS(name, target) \
+    TRB_TARGET(target) static void name(const trb_row *row, uint32_t first, trb_grid grid, trb_key_form form, \
+                                        trb_u64 key[TRB_ROW]) { \
+      trb_make_row_keys(row, first, grid, form, key); \
+    }
+  TRB_ROW_KEYS(trb_row_keys_avx2, "avx2")
+  TRB_ROW_KEYS(trb_row_keys_avx512, "avx512f")
 #endif
 
 static void trb_row_keys(const trb_row *row, uint32_t first, trb_grid grid, trb_key_form form, trb_u64 key[TRB_ROW]) {
 #ifdef TRB_AVX
-  if (trb_simd() >= 256) {
-    trb_row_keys_avx2(row, first, grid, form, key);
-    return;
-  }
+  const int bits = trb_simd();
+  if (bits >= 512) trb_row_keys_avx512(row, first, grid, form, key);
+  else if (bits >= 256) trb_row_keys_avx2(row, first, grid, form, key);
+  else
 #endif
   trb_make_row_keys(row, first, grid, form, key);
 }
