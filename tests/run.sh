@@ -6,10 +6,12 @@
 # `N passed, N failed`. Environment:
 #   CC, CFLAGS    when one is set, the test programs are compiled with them directly, without CMake
 #   TRBVH_OUT     build folder, instead of build in the project's root; the tests are in its tests folder
+#   TRBVH_JOBS    how many programs are built, and then run, at a time: 2 when it is not set
 here=$(cd "$(dirname "$0")" && pwd) || exit 1
 root=$(cd "$here/.." && pwd)
 out=${TRBVH_OUT:-build}
 case $out in /*) ;; *) out=$root/$out ;; esac
+jobs=${TRBVH_JOBS:-2}
 
 have() { command -v "$1" >/dev/null 2>&1; }
 
@@ -40,6 +42,23 @@ install_packages() {
   [ ! "$tools" ] || echo "not installed:" $tools "(what needs them is left out)"
 }
 
+# each COMMAND NAME ...: COMMAND with every name, a few at a time; prints the names as they end
+each() {
+  command=$1 lane=0
+  shift
+  rm -rf "$out/tests/taken"
+  mkdir "$out/tests/taken"
+  while [ "$lane" -lt "$jobs" ]; do
+    lane=$((lane + 1))
+    for name; do
+      mkdir "$out/tests/taken/$name" 2>/dev/null || continue     # another lane has it
+      "$command" "$name"
+      echo "$name"
+    done &
+  done
+  wait
+}
+
 # ---- build -----------------------------------------------------------------------------------------------------------
 compiler_flags() {   # of one test program, for a build without CMake
   case $1 in
@@ -47,22 +66,19 @@ compiler_flags() {   # of one test program, for a build without CMake
     test_cl*) echo -rdynamic ;;                    # its stand-in for OpenCL is found in the program itself
   esac
 }
+build_one() {
+  ${CC:-cc} ${CFLAGS--std=c99 -O2} $(compiler_flags "$1") -I"$root" "$here/$1.c" -o "$out/tests/$1" \
+    -lm -pthread -ldl >"$out/tests/$1.log" 2>&1
+}
 build_directly() {
-  jobs=0
-  for name; do
-    (${CC:-cc} ${CFLAGS--std=c99 -O2} $(compiler_flags "$name") -I"$root" "$here/$name.c" -o "$out/tests/$name" \
-      -lm -pthread -ldl) >"$out/tests/$name.log" 2>&1 &
-    jobs=$((jobs + 1))
-    [ $((jobs % 2)) != 0 ] || wait
-  done
-  wait
+  each build_one "$@" >/dev/null
   for name; do
     [ -x "$out/tests/$name" ] || cat "$out/tests/$name.log"
   done
 }
 build_with_cmake() {
   { cmake -S "$root" -B "$out/tests" -G "Unix Makefiles" -DTRBVH_BUILD_TESTS=ON -DTRBVH_BUILD_EXAMPLES=OFF &&
-    cmake --build "$out/tests" --parallel 2 -- -k; } >"$out/tests/build.log" 2>&1 || cat "$out/tests/build.log"
+    cmake --build "$out/tests" --parallel "$jobs" -- -k; } >"$out/tests/build.log" 2>&1 || cat "$out/tests/build.log"
 }
 build() {
   [ $# -gt 0 ] || return
@@ -75,16 +91,24 @@ build() {
 }
 
 # ---- run -------------------------------------------------------------------------------------------------------------
-passed=0 failed=0
-
-# run NAME COMMAND: prints its summary, and all of its output if something failed
 limit=$(have timeout && echo timeout 900)
-run() {
-  name=$1
+run_one() {
+  case $1 in
+    compile | consumer) set -- "$1" sh "$here/$1/run.sh" ;;
+    *) set -- "$1" "$out/tests/$1" ;;
+  esac
+  files=$out/tests/$1
   shift
-  $limit "$@" </dev/null >"$out/tests/$name.log" 2>&1
-  status=$?
-  summary=$(tail -n 1 "$out/tests/$name.log" | grep -E '^[0-9]+ passed, [0-9]+ failed$') || summary=
+  $limit "$@" </dev/null >"$files.log" 2>&1
+  echo $? >"$files.status"
+}
+
+# report NAME: its summary, and all of its output if something failed
+passed=0 failed=0
+report() {
+  log=$out/tests/$1.log status=none
+  [ ! -e "$out/tests/$1.status" ] || status=$(cat "$out/tests/$1.status")
+  summary=$(tail -n 1 "$log" | grep -E '^[0-9]+ passed, [0-9]+ failed$') || summary=
   good=${summary%% *} bad=${summary#*, }
   bad=${bad%% *}
   if [ "$status" = 127 ]; then
@@ -94,9 +118,21 @@ run() {
   elif [ "$status" != 0 ] && [ "$bad" = 0 ]; then
     bad=1 summary="$summary, but exit status $status"
   fi
-  if [ "$bad" != 0 ]; then cat "$out/tests/$name.log"; else grep '^left out' "$out/tests/$name.log"; fi
-  echo "$name: $summary"
+  if [ "$bad" != 0 ]; then cat "$log"; else grep '^left out' "$log"; fi
+  echo "$1: $summary"
   passed=$((passed + good)) failed=$((failed + bad))
+}
+run_all() {   # several at a time, told of in the order of their names here
+  for name; do rm -f "$out/tests/$name.status"; done
+  each run_one "$@" | {
+    ended=' '
+    for name; do
+      while case $ended in *" $name "*) false ;; esac && read -r one; do ended="$ended$one "; done
+      report "$name"
+    done
+    echo "$passed passed, $failed failed"
+    [ "$failed" = 0 ]
+  }
 }
 
 mkdir -p "$out/tests" || { echo "0 passed, 1 failed"; exit 1; }
@@ -111,8 +147,4 @@ for name; do
   case $name in compile | consumer) scripts="$scripts $name" ;; *) programs="$programs $name" ;; esac
 done
 build $programs
-for name in $programs; do run "$name" "$out/tests/$name"; done
-for name in $scripts; do run "$name" sh "$here/$name/run.sh"; done
-
-echo "$passed passed, $failed failed"
-[ "$failed" = 0 ]
+run_all $programs $scripts
