@@ -342,6 +342,7 @@ static void test_jobs_do_not_change_the_tree(void)
           size_t bound, scratch = 0;
           trbvh_result result;
           if (at >= HOOK_SCENES && w % 3 != 1) continue;
+          if (QUICK_OR((at + (unsigned)preset + system + w) % 2, 0)) continue;   /* the next scene or preset has it */
           memset(&bvh, 0, sizeof bvh);
           memset(&log, 0, sizeof log);
           memset(&c, 0, sizeof c);
@@ -444,7 +445,7 @@ static void test_scratch_of_the_user(void)
   unsigned at, i;
   int preset;
   for (at = 0; at < HOOK_LARGE; ++at)
-    for (preset = 0; preset < PRESET_COUNT; ++preset) {
+    for (preset = 0; preset < QUICK_OR(PRESET_COUNT - 1, PRESET_COUNT); ++preset) {   /* BEST is HIGH */
       scene s;
       trbvh_geometry g;
       trbvh_options o = preset_options(preset);
@@ -588,7 +589,7 @@ static void test_jobs_on_many_groups(void)
         job_log log;
         memset(&bvh, 0, sizeof bvh);
         memset(&log, 0, sizeof log);
-        if (system > 2 && w % 2 == 0) continue;
+        if (QUICK_OR((system + w + (unsigned)preset) % 3 != 0, system > 2 && w % 2 == 0)) continue;   /* each, one preset */
         o.jobs.parallel_for = systems[system].run;
         o.jobs.user = &log;
         o.jobs.width = some[w];
@@ -620,7 +621,7 @@ static void test_single_outlier(void)
       make_random(&s, 50000);
       for (k = 0; k < 9; ++k) s.positions[9 * places[p] + k] += far ? 2e6f : -2e6f;
       g = scene_geometry(&s);
-      for (preset = 0; preset < PRESET_COUNT; ++preset) {
+      for (preset = 0; preset < QUICK_OR(PRESET_COUNT - 1, PRESET_COUNT); ++preset) {   /* BEST is HIGH */
         trbvh_options o = preset_options(preset);
         trbvh want;
         walk_info info;
@@ -638,6 +639,7 @@ static void test_single_outlier(void)
           for (w = 2; w <= 4; w += 2) {
             trbvh bvh;
             job_log log;
+            if (QUICK_OR((far + (unsigned)preset + system + w / 2) % 2, 0)) continue;
             memset(&bvh, 0, sizeof bvh);
             memset(&log, 0, sizeof log);
             o.jobs.parallel_for = systems[system].run;
