@@ -147,4 +147,4 @@ for name; do
   case $name in compile | consumer) scripts="$scripts $name" ;; *) programs="$programs $name" ;; esac
 done
 build $programs
-run_all $programs $scripts
+run_all $scripts $programs   # compile is long, and must not be left over at the end
