@@ -36,19 +36,21 @@ static const char usage[] =
   "  --small        meshes of 12 to 1000 triangles, and a batch of many, instead of meshes\n";
 
 // >>rows ----------------------------------------------------------------------------------------------------
-/* trbvh's presets, BEST being the same as HIGH in this version; then Embree's. Those of one level are compared. */
+/* trbvh's presets, BEST being the same as HIGH in this version; FAST once more, from boxes, which makes no triangles:
+ * the work of Embree's builders, which are last. Those of one level are compared. */
 typedef struct builder { const char *name; int level, quality; uint32_t min_leaf, max_leaf; } builder;
 static const builder builders[] = {
   {"trbvh FAST", 0, TRBVH_QUALITY_FAST, 0, 0},
   {"trbvh MEDIUM", 1, TRBVH_QUALITY_MEDIUM, 0, 0},
   {"trbvh HIGH", 2, TRBVH_QUALITY_HIGH, 0, 0},
+  {"FAST, boxes", 0, TRBVH_QUALITY_FAST, 0, 0},
 #ifdef BENCH_EMBREE
   {"Embree LOW", 0, RTC_BUILD_QUALITY_LOW, 4, 4},
   {"Embree MEDIUM", 1, RTC_BUILD_QUALITY_MEDIUM, 1, 8},
   {"Embree HIGH", 2, RTC_BUILD_QUALITY_HIGH, 1, 8},
 #endif
 };
-enum { PRESETS = 3, BUILDERS = sizeof builders / sizeof *builders, REPS_MAX = 99 };
+enum { PRESETS = 3, FROM_BOXES = PRESETS, OURS, BUILDERS = sizeof builders / sizeof *builders, REPS_MAX = 99 };
 
 /* Columns of a row: times are ms, sizes bytes per triangle. "other" is outside of all stages: starting threads, say. */
 enum { RATE, MS, FRESH, STAGE, OTHER = STAGE + 7, SAH, RESULT, SCRATCH, RATIO, SAH_RATIO, COLUMNS };
@@ -253,6 +255,32 @@ typedef struct run {                   /* of one builder */
   double ms[SAH][REPS_MAX];            /* by column */
 } run;
 
+typedef struct box { float low[3], high[3]; } box;
+static const box no_box = {{FLT_MAX, FLT_MAX, FLT_MAX}, {-FLT_MAX, -FLT_MAX, -FLT_MAX}};
+static void extend(box *a, const float p[3])
+{
+  for (int i = 0; i < 3; i++) {
+    if (p[i] < a->low[i]) a->low[i] = p[i];
+    if (p[i] > a->high[i]) a->high[i] = p[i];
+  }
+}
+/* Those of the triangles; low > high, which is left out, for one that is not finite. */
+static box *boxes_of(const ex_mesh *mesh)
+{
+  box *boxes = (box *)ex_allocate(mesh->triangle_count, sizeof *boxes);
+  for (size_t i = 0; i < mesh->triangle_count; i++) {
+    int finite = 1;
+    boxes[i] = no_box;
+    for (size_t k = 3 * i; k < 3 * i + 3; k++) {
+      ex_vec p;
+      finite &= ex_mesh_finite_corner(mesh, k, &p);
+      extend(&boxes[i], mesh->positions + 3 * (size_t)mesh->indices[k]);
+    }
+    if (!finite) boxes[i] = no_box;
+  }
+  return boxes;
+}
+
 static trbvh_options options_of(int preset, uint32_t threads, trbvh_stats *stats)
 {
   trbvh_options options = {.quality = (trbvh_quality)builders[preset].quality, .stats = stats};
@@ -336,15 +364,6 @@ static void *create_leaf(RTCThreadLocalAllocator allocator, const struct RTCBuil
   return (char *)leaf + 1;
 }
 
-typedef struct box { float low[3], high[3]; } box;
-static const box no_box = {{FLT_MAX, FLT_MAX, FLT_MAX}, {-FLT_MAX, -FLT_MAX, -FLT_MAX}};
-static void extend(box *a, const float p[3])
-{
-  for (int i = 0; i < 3; i++) {
-    if (p[i] < a->low[i]) a->low[i] = p[i];
-    if (p[i] > a->high[i]) a->high[i] = p[i];
-  }
-}
 /* The overlap of two boxes; Embree's are three floats, one of something else, three floats. */
 static void set_overlap(struct RTCBounds *out, const box *a, const struct RTCBuildPrimitive *prim)
 {
@@ -387,28 +406,21 @@ static bool count_bytes(void *user, ssize_t bytes, bool post)
   pthread_mutex_unlock(&e->lock);
   return true;
 }
-static void make_boxes(embree *e)      /* leaves out triangles that are not finite, as trbvh does */
+static void make_boxes(embree *e, const box *boxes)
 {
   size_t triangles = e->mesh->triangle_count;
   e->memory = ex_allocate(triangles + triangles * 13 / 10 + 1, sizeof *e->boxes);
   e->boxes = (struct RTCBuildPrimitive *)(((uintptr_t)e->memory + 31) & ~(uintptr_t)31);   /* as Embree loads them */
   for (size_t i = 0; i < triangles; i++) {
-    box bounds = no_box;
-    int finite = 1;
-    for (size_t k = 3 * i; k < 3 * i + 3; k++) {
-      ex_vec p;
-      finite &= ex_mesh_finite_corner(e->mesh, k, &p);
-      extend(&bounds, e->mesh->positions + 3 * (size_t)e->mesh->indices[k]);
-    }
-    memcpy(&e->boxes[e->count].lower_x, bounds.low, sizeof bounds.low);
-    memcpy(&e->boxes[e->count].upper_x, bounds.high, sizeof bounds.high);
+    memcpy(&e->boxes[e->count].lower_x, boxes[i].low, sizeof boxes[i].low);
+    memcpy(&e->boxes[e->count].upper_x, boxes[i].high, sizeof boxes[i].high);
     e->boxes[e->count].primID = (unsigned)i;
-    e->count += (size_t)finite;
+    e->count += boxes[i].low[0] <= boxes[i].high[0];
   }
   e->work = e->boxes + triangles;
   e->room = e->count * 13 / 10;        /* as many splits as HIGH's */
 }
-static void start_embree(embree *e, const ex_mesh *mesh, uint32_t threads)
+static void start_embree(embree *e, const ex_mesh *mesh, const box *boxes, uint32_t threads)
 {
   char config[32];
   memset(e, 0, sizeof *e);
@@ -418,12 +430,12 @@ static void start_embree(embree *e, const ex_mesh *mesh, uint32_t threads)
   if (!e->device) ex_die("Embree: no device");
   rtcSetDeviceMemoryMonitorFunction(e->device, count_bytes, e);
   e->mesh = mesh;
-  make_boxes(e);
-  for (int i = PRESETS; i < BUILDERS; i++) e->bvhs[i] = rtcNewBVH(e->device);
+  make_boxes(e, boxes);
+  for (int i = OURS; i < BUILDERS; i++) e->bvhs[i] = rtcNewBVH(e->device);
 }
 static void end_embree(embree *e)      /* before the next device starts, which would get this one's threads */
 {
-  for (int i = PRESETS; i < BUILDERS; i++) rtcReleaseBVH(e->bvhs[i]);
+  for (int i = OURS; i < BUILDERS; i++) rtcReleaseBVH(e->bvhs[i]);
   rtcReleaseDevice(e->device);
   pthread_mutex_destroy(&e->lock);
   free(e->memory);
@@ -492,49 +504,53 @@ static void judge_embree(const embree *e, run *r)
 /* All builders with one mesh and one number of threads. */
 static void measure(bench *b, const input *in, const ex_mesh *mesh, int turn, size_t more, row rows[BUILDERS])
 {
-  trbvh_geometry geometry = ex_mesh_geometry(mesh);
+  trbvh_geometry geometries[OURS];
+  box *boxes = boxes_of(mesh);
   run *runs = (run *)ex_allocate(BUILDERS, sizeof *runs);
   uint32_t threads = b->threads[turn];
   const char *slash = strrchr(in->name, '/'), *name = slash ? slash + 1 : in->name;
-  for (int i = 0; i < PRESETS; i++) {
+  for (int i = 0; i < OURS; i++) {
+    geometries[i] = ex_mesh_geometry(mesh);
+    if (i == FROM_BOXES) geometries[i] = (trbvh_geometry){.boxes = boxes->low, .count = mesh->triangle_count};
     runs[i].options = options_of(i, threads, &runs[i].stats);
-    keep_scratch(&runs[i].options, &geometry);
+    keep_scratch(&runs[i].options, &geometries[i]);
   }
 #ifdef BENCH_EMBREE
   embree e;
-  start_embree(&e, mesh, threads);
+  start_embree(&e, mesh, boxes, threads);
 #endif
   for (int round = 0; round <= b->reps; round++) {   /* the first, which allocates, does not count */
     int rep = round ? round - 1 : 0;
     show_progress(b, name, in->size, (turn + round / (b->reps + 1.0)) / b->turns, more);
-    for (int i = 0; i < PRESETS; i++) build_trbvh(&runs[i], &geometry, i, threads, rep);
+    for (int i = 0; i < OURS; i++) build_trbvh(&runs[i], &geometries[i], i, threads, rep);
 #ifdef BENCH_EMBREE
-    for (int i = PRESETS; i < BUILDERS; i++) build_embree(&e, &runs[i], i, rep);
+    for (int i = OURS; i < BUILDERS; i++) build_embree(&e, &runs[i], i, rep);
 #endif
   }
 #ifdef BENCH_EMBREE
-  for (int i = PRESETS; i < BUILDERS; i++) judge_embree(&e, &runs[i]);
+  for (int i = OURS; i < BUILDERS; i++) judge_embree(&e, &runs[i]);
   end_embree(&e);
 #endif
   for (int i = 0; i < BUILDERS; i++) {
     run *r = &runs[i];
     rows[i] = new_row(name, mesh->triangle_count, threads, &builders[i], ex_median(r->ms[MS], b->reps));
     double *values = rows[i].values;
-    for (int k = FRESH; k < SAH && i < PRESETS; k++) values[k] = ex_median(r->ms[k], b->reps);
+    for (int k = FRESH; k < SAH && i < OURS; k++) values[k] = ex_median(r->ms[k], b->reps);
     values[SAH] = r->sah;
     values[RESULT] = r->sah < 0 ? -1 : r->result / rows[i].triangles;
     values[SCRATCH] = r->scratch / rows[i].triangles;
     trbvh_free(&r->tree);
     free(r->options.scratch);
   }
-  for (int i = 0; i < PRESETS; i++) {
-    for (int k = PRESETS; k < BUILDERS; k++) {
+  for (int i = 0; i < OURS; i++) {
+    for (int k = OURS; k < BUILDERS; k++) {
       if (builders[i].level != builders[k].level) continue;
       rows[i].values[RATIO] = rows[i].values[RATE] / rows[k].values[RATE];
       if (rows[k].values[SAH] > 0) rows[i].values[SAH_RATIO] = rows[i].values[SAH] / rows[k].values[SAH];
     }
   }
   for (int i = 0; i < BUILDERS; i++) write_csv(b, &rows[i]);
+  free(boxes);
   free(runs);
 }
 
@@ -552,14 +568,14 @@ static void print_number(int width, int decimals, double value)   /* blank where
 }
 static void print_rows(const row rows[BUILDERS])
 {
-  int end = BUILDERS > PRESETS ? SAH_RATIO : RATIO;
+  int end = BUILDERS > OURS ? SAH_RATIO : RATIO;
   printf("\n%s: %.0f triangles; threads: %u; times in ms, result and scratch memory in bytes/triangle\n%-15s",
          rows->mesh, rows->triangles, rows->threads, "");
   print_titles(0, end);
   for (int i = 0; i < BUILDERS; i++) {
     printf("\n  %-13s", builders[i].name);
     for (int k = 0; k < end; k++) print_number(width_of(k), k == RESULT || k == SCRATCH ? 1 : 2, rows[i].values[k]);
-    if (i >= PRESETS) continue;
+    if (i >= OURS) continue;
     printf("\n%15s%*s", "ns/triangle", width_of(RATE), "");
     for (int k = MS; k < SAH; k++) print_number(width_of(k), 1, ns_per_triangle(&rows[i], k));
   }
@@ -584,7 +600,7 @@ static double geometric_mean(const bench *b, int turn, int number, int column)
 static void print_means(const bench *b)
 {
   static const int columns[] = {RATE, SAH, RATIO, SAH_RATIO};
-  int shown = BUILDERS > PRESETS ? 4 : 2;
+  int shown = BUILDERS > OURS ? 4 : 2;
   printf("\n%-15s", "geometric means");
   for (int turn = 0; turn < b->turns; turn++) {
     printf("  |%4u thread%s", b->threads[turn], turn ? "s" : " ");
