@@ -1444,9 +1444,9 @@ TRB_CORE void trb_treelet_costs(const float *leaves, float *table, float *sums, 
   TRB_DEFINE_TREELET_COSTS(TRB_TARGET("avx512f") static void trb_treelet_costs_avx512)
   #endif
 
-/* Few lanes need no long vectors. */
+/* Vectors longer than the lanes that are in use would only be slower to start. */
 static void trb_treelet_costs(const float *leaves, float *table, float *sums, trbvh_u32 lanes, trb_costs costs) {
-  const int simd = lanes > 4 ? trb_simd() : 128;
+  const int simd = trb_simd();
   trbvh_u32 lane;
 #ifdef TRB_AVX
   if (simd == 512 && lanes > 8) trb_treelet_costs_avx512(leaves, table, sums, costs);

@@ -1140,7 +1140,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "static void trb_treelet_costs(const float *leaves, float *table, float *sums, trbvh_u32 lanes, trb_costs costs) {\n",
-  "  const int simd = lanes > 4 ? trb_simd() : 128;\n",
+  "  const int simd = trb_simd();\n",
   "  trbvh_u32 lane;\n",
   "#ifdef TRB_AVX\n",
   "  if (simd == 512 && lanes > 8) trb_treelet_costs_avx512(leaves, table, sums, costs);\n",
@@ -3037,7 +3037,7 @@ static const char *const trb_cl_text[] = {
 };
 #define TRB_CL_CORE_LINES 1847u   /* entries of trb_cl_text for user kernels: types, core, traversal */
 #define TRB_CL_LINES      2917u   /* all entries */
-#define TRB_CL_HASH       "bc211bd509057c5d"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_HASH       "fe9287d0da9300a2"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
