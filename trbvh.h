@@ -1793,11 +1793,7 @@ TRB_CORE trbvh_u32 trb_leaf_prims(const trb_collapser *c, trbvh_node leaf, trbvh
 }
 
 /* A node's part in equation 1's sum, with half areas. */
-TRB_CORE TRB_REAL trb_sah_term(trbvh_node node, TRB_REAL weight) {
-  TRB_REAL x = (TRB_REAL)node.max[0] - node.min[0], y = (TRB_REAL)node.max[1] - node.min[1];
-  TRB_REAL z = (TRB_REAL)node.max[2] - node.min[2];
-  return weight * (x * y + z * (x + y));
-}
+TRB_CORE TRB_REAL trb_sah_term(trbvh_node node, TRB_REAL weight) { return weight * trb_area(node); }
 
 /* Writes an inner node whose children will be pair number `pair`. */
 TRB_CORE void trb_emit_inner(const trb_collapser *c, trbvh_node node, trbvh_u32 dst, trbvh_u32 pair) {
@@ -3192,11 +3188,20 @@ static trbvh_result trb_make_room(trb_build *b, trbvh *bvh, uint32_t leaves, uin
   return TRBVH_OK;
 }
 
+/* Are areas of boxes in one of this area within float's range? Else equation 1 needs double. */
+static int trb_fits_areas(float root) { return root > 1e-30f && root < FLT_MAX; }
+
+static double trb_exact_sah(const trb_build *b) {
+  const float node = b->options.cost_node, prim = b->options.cost_prim;
+  return trbvh_sah(&b->tree, node > 0 ? node : -1, prim > 0 ? prim : -1);
+}
+
 static trbvh_result trb_emit(trb_build *b, trbvh *bvh) {
   trb_collapser c;
   uint32_t leaves = 0, prims = 0, i;
   trbvh_result result;
-  double sah = b->sah, root = trb_sah_term(b->nodes[0], 1);
+  double sah = b->sah;
+  const float root = trb_area(b->nodes[0]);
   for (i = 0; i < b->task_count; i++) {
     leaves += b->tasks[i].leaves;
     prims += b->tasks[i].prims;
@@ -3211,7 +3216,7 @@ static trbvh_result trb_emit(trb_build *b, trbvh *bvh) {
     sah += b->tasks[i].sah;
     b->stats.max_depth = TRB_MAX(b->tasks[i].max_depth, b->stats.max_depth);
   }
-  b->stats.sah_cost = root > 0 ? sah / root : 0;
+  b->stats.sah_cost = trb_fits_areas(root) ? sah / root : trb_exact_sah(b);
   return TRBVH_OK;
 }
 
@@ -3426,16 +3431,21 @@ TRBVH_API trbvh_result trbvh_occluded_n(const trbvh *bvh, const trbvh_ray *rays,
 }
 
 // >>validate --------------------------------------------------------------------------------------------------------
+static double trb_exact_area(trbvh_node n) {         /* half of it */
+  double x = (double)n.max[0] - n.min[0], y = (double)n.max[1] - n.min[1], z = (double)n.max[2] - n.min[2];
+  return x * y + z * (x + y);
+}
+
 TRBVH_API double trbvh_sah(const trbvh *bvh, float cost_node, float cost_prim) {
   double node_weight = cost_node == 0 ? 1.2 : TRB_MAX(cost_node, 0);
   double prim_weight = cost_prim == 0 ? 1.0 : TRB_MAX(cost_prim, 0);
   double sum = 0, root;
   uint32_t i;
   if (!bvh || !bvh->node_count) return 0;
-  root = trb_sah_term(bvh->nodes[0], 1);
+  root = trb_exact_area(bvh->nodes[0]);
   for (i = 0; i < bvh->node_count; i += i ? 1 : 2) {
     const trbvh_node *n = &bvh->nodes[i];
-    sum += trb_sah_term(*n, n->count ? prim_weight * n->count : node_weight);
+    sum += trb_exact_area(*n) * (n->count ? prim_weight * n->count : node_weight);
   }
   return root > 0 ? sum / root : 0;
 }

@@ -1460,11 +1460,7 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "\n",
   "\n",
-  "TRB_CORE TRB_REAL trb_sah_term(trbvh_node node, TRB_REAL weight) {\n",
-  "  TRB_REAL x = (TRB_REAL)node.max[0] - node.min[0], y = (TRB_REAL)node.max[1] - node.min[1];\n",
-  "  TRB_REAL z = (TRB_REAL)node.max[2] - node.min[2];\n",
-  "  return weight * (x * y + z * (x + y));\n",
-  "}\n",
+  "TRB_CORE TRB_REAL trb_sah_term(trbvh_node node, TRB_REAL weight) { return weight * trb_area(node); }\n",
   "\n",
   "\n",
   "TRB_CORE void trb_emit_inner(const trb_collapser *c, trbvh_node node, trbvh_u32 dst, trbvh_u32 pair) {\n",
@@ -1565,7 +1561,7 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE void trb_prefetch_pairs(const trb_collapser *c, trbvh_u32 ref, trbvh_u32 count) {\n",
   "  for (; count-- && ref > 2 * TRB_AHEAD; ref--) TRB_PREFETCH(&c->nodes[2 * (ref - 2 * TRB_AHEAD)]);\n",
   "}\n",
-  "#line 1905 \"trbvh.h\"\n",
+  "#line 1901 \"trbvh.h\"\n",
   "TRB_SHARED void trb_settle_task(const trb_collapser *c, TRB_GLOBAL trb_task *task) {\n",
   "  TRB_GLOBAL trbvh_u32 *order = c->words.plane[0] + task->first_ref, *prims = c->words.plane[1] + task->first_ref;\n",
   "  trbvh_u32 waiting = 0, pairs = 0, refs = task->first_ref, prim = 0, max_depth = 0, i;\n",
@@ -1733,7 +1729,7 @@ static const char *const trb_cl_text[] = {
   "    default: trb_make_form(mesh, 4, prims, first, end, out); break;\n",
   "  }\n",
   "}\n",
-  "#line 2083 \"trbvh.h\"\n",
+  "#line 2079 \"trbvh.h\"\n",
   "#define TRB_UNIT 5.9604645e-8f\n",
   "#define TRB_ABS(x) ((x) < 0 ? -(x) : (x))\n",
   "typedef struct trb_ray {\n",
@@ -1811,7 +1807,7 @@ static const char *const trb_cl_text[] = {
   "  along = TRB_MIN(along, 1);\n",
   "  return TRB_MAX(along, 0);\n",
   "}\n",
-  "#line 2167 \"trbvh.h\"\n",
+  "#line 2163 \"trbvh.h\"\n",
   "TRB_CORE int trb_hit_triangle(const TRB_GLOBAL trbvh_triangle *t, const trb_ray *r, float tmax, trbvh_hit *hit) {\n",
   "  const int x = r->axis[0], y = r->axis[1], z = r->axis[2];\n",
   "  const trb_corner a = trb_see(t->v0[x], t->v0[y], t->v0[z], r);\n",
@@ -1852,7 +1848,7 @@ static const char *const trb_cl_text[] = {
   "  hit->u = hit->v = 0;\n",
   "  hit->prim = hit->instance = TRBVH_NONE;\n",
   "}\n",
-  "#line 2211 \"trbvh.h\"\n",
+  "#line 2207 \"trbvh.h\"\n",
   "TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbvh_triangle *triangles,\n",
   "                       const trb_ray *r, int any, trbvh_hit *hit) {\n",
   "  trbvh_u32 stack_node[TRBVH_MAX_DEPTH], height = 0, node = 0, i;\n",
@@ -3035,9 +3031,9 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "#endif\n",
 };
-#define TRB_CL_CORE_LINES 1847u   /* entries of trb_cl_text for user kernels: types, core, traversal */
-#define TRB_CL_LINES      2917u   /* all entries */
-#define TRB_CL_HASH       "fe9287d0da9300a2"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_CORE_LINES 1843u   /* entries of trb_cl_text for user kernels: types, core, traversal */
+#define TRB_CL_LINES      2913u   /* all entries */
+#define TRB_CL_HASH       "cf43923f59b5ce04"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
@@ -4266,10 +4262,7 @@ static trbvh_result trb_cl_build_tree(trbvh_device *device, trb_build *b, trbvh 
   if (!result && w->plan.leaves) {
     result = trb_make_room(b, bvh, w->plan.leaves, w->plan.prims);
     if (!result) result = trb_cl_write_block(w);
-    /* float's range was too small for the areas */
-    if (!result && !(w->plan.root_area > 1e-30f && w->plan.sah < FLT_MAX))
-      b->stats.sah_cost = trbvh_sah(&b->tree, b->options.cost_node > 0 ? b->options.cost_node : -1,
-                                    b->options.cost_prim > 0 ? b->options.cost_prim : -1);
+    if (!result && !(trb_fits_areas(w->plan.root_area) && w->plan.sah < FLT_MAX)) b->stats.sah_cost = trb_exact_sah(b);
   }
   if (result) cl->api.Finish(cl->queue);             /* before memory that it shares goes */
   trb_cl_free_output(w);
