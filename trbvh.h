@@ -1131,6 +1131,13 @@ TRB_SHARED trbvh_u32 trb_split_reference(const trb_mesh *mesh, trb_grid grid, tr
 #define TRB_SMALL_SORT 4096u             /* so few keys are sorted by digits of 8 bits, as counters take time, too ... */
 #define TRB_TINY_SORT  48u               /* ... and so few by insertion */
 #define TRB_SORT_BLOCK 65536u            /* keys a job counts and scatters */
+/* More packed keys than a cache holds: by the first digit first, into buckets; then each of these by itself. */
+#ifndef TRB_LARGE_SORT                   /* lower in a test */
+  #define TRB_LARGE_SORT 131072u         /* more than TRB_SMALL_SORT */
+#endif
+#define TRB_BUCKETS       32u            /* a job sorts */
+#define TRB_BUCKET_PASSES 4u
+#define TRB_BUCKET_BITS   9u             /* of a digit at most: TRB_CODE_BITS without the first digit, in that many passes */
 
 /* What keys look like: bits of code, above shift bits of index. */
 typedef struct trb_key_form { trbvh_u32 packed, bits, shift; } trb_key_form;
@@ -3092,8 +3099,50 @@ static int trb_sort(trb_build *b, uint32_t shift, uint32_t bits) {
   return 0;
 }
 
+/* Where the keys with each first digit end, once trb_sort has sorted by that. */
+static const uint32_t *trb_bucket_ends(const trb_build *b) {
+  return b->histograms + (size_t)(trb_blocks(b->ref_count, TRB_SORT_BLOCK) - 1) * b->digits;
+}
+
+/* Sorts a bucket's keys by the bits below their first digit, in a cache, with an even number of passes. */
+static void trb_sort_bucket(const trb_build *b, uint32_t first, uint32_t count) {
+  const uint32_t bits = trb_blocks(b->key_form.bits - TRB_DIGIT_BITS, TRB_BUCKET_PASSES);
+  trb_u64 *from = b->keys + first, *to = b->sorted + first, *swap;
+  uint32_t next[1u << TRB_BUCKET_BITS], shift = b->key_form.shift, pass;
+  if (count <= TRB_TINY_SORT) {
+    trb_sort_by_insertion(from, count, shift);
+    return;
+  }
+  for (pass = 0; pass < TRB_BUCKET_PASSES; pass++, shift += bits) {
+    trb_count_digits(from, count, shift, 1u << bits, next);
+    trb_place_digits(next, 1, 1u << bits);
+    trb_scatter_keys(from, count, shift, 1u << bits, next, to);
+    swap = from; from = to; to = swap;
+  }
+}
+
+static void trb_bucket_job(void *context, uint32_t index) {
+  const trb_build *b = (const trb_build *)context;
+  const uint32_t *end = trb_bucket_ends(b);
+  uint32_t digit = index * TRB_BUCKETS, first = digit ? end[digit - 1] : 0, i;
+  for (i = 0; i < TRB_BUCKETS; i++, first = end[digit++]) trb_sort_bucket(b, first, end[digit] - first);
+}
+
+/* The same order as from the last digit on, unless one bucket holds so much that its job would be waited for. */
+static int trb_sort_many(trb_build *b) {
+  const uint32_t *end;
+  uint32_t digit, first, largest = 0;
+  if (trb_sort(b, b->key_form.shift + b->key_form.bits - TRB_DIGIT_BITS, TRB_DIGIT_BITS)) return 1;
+  end = trb_bucket_ends(b);
+  for (digit = first = 0; digit < TRB_DIGITS; first = end[digit++]) largest = TRB_MAX(end[digit] - first, largest);
+  if (largest > b->ref_count / 4) return trb_sort(b, b->key_form.shift, b->key_form.bits);
+  return trb_run(&b->runner, TRB_DIGITS / TRB_BUCKETS, trb_bucket_job, b);
+}
+
 static trbvh_result trb_sort_keys(trb_build *b) {
-  int cancelled = trb_sort(b, b->key_form.shift, b->key_form.bits);
+  int cancelled;
+  if (b->key_form.packed && b->ref_count > TRB_LARGE_SORT) cancelled = trb_sort_many(b);
+  else cancelled = trb_sort(b, b->key_form.shift, b->key_form.bits);
   if (!b->key_form.packed) cancelled = cancelled || trb_make_high_keys(b) || trb_sort(b, 32, 32);
   return cancelled ? TRBVH_CANCELLED : TRBVH_OK;
 }

@@ -2,7 +2,9 @@
  * against the radix tree, the rounds against the rule that fixes them, the depth bound, the clipping. Sees the
  * library's inside. */
 static unsigned packed_refs = 1u << 24;        /* up to how many references sort keys are packed */
+static unsigned large_sort = 131072;           /* from how many on they are sorted by buckets */
 #define TRB_PACKED_REFS packed_refs
+#define TRB_LARGE_SORT large_sort
 #include <assert.h>
 #define TRBVH_ASSERT(x) assert(x)
 #define TRBVH_IMPLEMENTATION
@@ -521,16 +523,17 @@ static void test_hierarchy(void) {
   static const uint32_t counts[] = {1, 2, 3, 7, 40, 1000, BOXES};
   trbvh_node *boxes = (trbvh_node *)xmalloc(BOXES * sizeof *boxes);
   float *memory = (float *)xmalloc(BOXES * 24);
-  uint32_t kind, c, packed;
+  uint32_t kind, c, form;                          /* of keys: long ones, packed ones, these sorted by buckets */
   radix x;
   radix_start(&x, BOXES);
-  for (packed = 0; packed < 2; packed++)
+  for (form = 0; form < 3; form++)
     for (kind = 0; kind < 4 + HOLES; kind++)
       for (c = 0; c < sizeof counts / sizeof counts[0]; c++) {
         trb_build b;
         trbvh_geometry g;
-        CONTEXT("%u boxes of kind %u, packed %u", counts[c], kind, packed);
-        packed_refs = packed ? 1u << 24 : 0;
+        CONTEXT("%u boxes of kind %u, form %u", counts[c], kind, form);
+        packed_refs = form ? 1u << 24 : 0;
+        large_sort = form == 2 ? 5000 : 131072;
         some_boxes(boxes, counts[c], kind < 4 ? kind : 0);
         if (kind >= 4) make_holes(boxes, counts[c], kind - 4);
         g = geometry_of_boxes(boxes, counts[c], memory);
@@ -549,6 +552,7 @@ static void test_hierarchy(void) {
         end_build(&b);
       }
   packed_refs = 1u << 24;
+  large_sort = 131072;
   radix_stop(&x);
   free(boxes);
   free(memory);
