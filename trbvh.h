@@ -1817,7 +1817,7 @@ typedef struct trb_task {
   trbvh_u32 dst, pair, first_prim;
   TRB_REAL  sah;
 } trb_task;
-#define TRB_TASKS_MAX(refs) (TRB_OPEN_MAX * ((refs) / TRB_BLOCK + 1))
+#define TRB_TASKS_MAX(refs) (TRB_OPEN_MAX * ((refs) / TRB_BLOCK) + 1)
 
 /* Neighbouring tasks that one job does: a quarter of TRB_BLOCK references or more but for the last one. */
 typedef struct trb_group { trbvh_u32 first_task, tasks; } trb_group;
