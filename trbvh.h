@@ -1817,7 +1817,7 @@ typedef struct trb_task {
   trbvh_u32 dst, pair, first_prim;
   TRB_REAL  sah;
 } trb_task;
-#define TRB_TASKS_MAX(refs) (TRB_OPEN_MAX * ((refs) / TRB_BLOCK) + 1)
+#define TRB_TASKS_MAX(refs) (2 * TRBVH_MAX_DEPTH * ((refs) / TRB_BLOCK) + 1)
 
 /* Neighbouring tasks that one job does: a quarter of TRB_BLOCK references or more but for the last one. */
 typedef struct trb_group { trbvh_u32 first_task, tasks; } trb_group;
@@ -2599,8 +2599,7 @@ typedef struct trb_build {
   trb_u64              *keys, *sorted;   /* ref_max each */                      float *priorities;
   trbvh_node           *nodes;           /* 2 * ref_max + 2 */                   trbvh_node *unsplit;   /* like refs */
   trb_block            *blocks;
-  uint32_t             *histograms;
-  trb_range            *ranges;
+  trb_range            *ranges;          /* for each TRB_BLOCK of ref_max */     uint32_t *histograms;  /* the sort's, smaller */
   trb_group            *groups;
   trb_task             *tasks;
   uint32_t              block_count, task_count, group_count;
@@ -2746,10 +2745,10 @@ static size_t trb_lay_out(trb_build *b, char *base) {
   TRB_PART(ranges,     trb_range,  blocks * sizeof(trb_range))
   TRB_PART(groups,     trb_group,  TRB_GROUPS_MAX(n) * sizeof(trb_group))
   TRB_PART(tasks,      trb_task,   TRB_TASKS_MAX(n) * sizeof(trb_task))
-  TRB_PART(histograms, uint32_t,   trb_blocks(b->ref_max, TRB_SORT_BLOCK) * TRB_DIGITS * sizeof(uint32_t))
   #undef TRB_PART
   b->priorities = (float *)(void *)b->keys;
   b->unsplit = b->nodes;
+  b->histograms = (uint32_t *)(void *)b->ranges;
   if (!b->split_max) b->refs = b->unsplit = NULL;
   return size + TRB_LINE;
 }

@@ -1484,7 +1484,7 @@ static const char *const trb_cl_text[] = {
   "  trbvh_u32 dst, pair, first_prim;\n",
   "  TRB_REAL  sah;\n",
   "} trb_task;\n",
-  "#define TRB_TASKS_MAX(refs) (TRB_OPEN_MAX * ((refs) / TRB_BLOCK) + 1)\n",
+  "#define TRB_TASKS_MAX(refs) (2 * TRBVH_MAX_DEPTH * ((refs) / TRB_BLOCK) + 1)\n",
   "\n",
   "\n",
   "typedef struct trb_group { trbvh_u32 first_task, tasks; } trb_group;\n",
@@ -3040,7 +3040,7 @@ static const char *const trb_cl_text[] = {
 };
 #define TRB_CL_CORE_LINES 1850u   /* entries of trb_cl_text for user kernels: types, core, traversal */
 #define TRB_CL_LINES      2920u   /* all entries */
-#define TRB_CL_HASH       "f5ef1a30acd43a47"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_HASH       "9117c4b71ba053bc"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
