@@ -1809,7 +1809,8 @@ TRB_CORE void trb_emit_inner(const trb_collapser *c, trbvh_node node, trbvh_u32 
   c->out[dst] = node;
 }
 
-/* A subtree of TRB_BLOCK references at most: what is known of it, what it came to, and its place in the result. */
+/* A subtree of TRB_BLOCK references at most: what is known of it, what it came to, and its place in the result. A block
+ * of a final tree leaves no more than 2 * 63 + 1 open, one for each bit of the keys at either end. */
 typedef struct trb_task {
   trbvh_u32 node, depth, first_ref;
   trbvh_u32 end_pair;                    /* of a final tree's pairs */
@@ -1894,6 +1895,7 @@ TRB_SHARED void trb_restructure_group(const trb_collapser *c, const TRB_GLOBAL t
   }
 }
 
+/* A node that waits for the walk. */
 typedef struct trb_visit { trbvh_u32 node, depth; } trb_visit;
 
 /* The walk runs through memory backwards, as far as treelets have not moved things: asks for the pairs that it will come

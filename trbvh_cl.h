@@ -1477,6 +1477,7 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "\n",
   "\n",
+  "\n",
   "typedef struct trb_task {\n",
   "  trbvh_u32 node, depth, first_ref;\n",
   "  trbvh_u32 end_pair;\n",
@@ -1561,6 +1562,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "}\n",
   "\n",
+  "\n",
   "typedef struct trb_visit { trbvh_u32 node, depth; } trb_visit;\n",
   "\n",
   "\n",
@@ -1568,7 +1570,7 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE void trb_prefetch_pairs(const trb_collapser *c, trbvh_u32 ref, trbvh_u32 count) {\n",
   "  for (; count-- && ref > 2 * TRB_AHEAD; ref--) TRB_PREFETCH(&c->nodes[2 * (ref - 2 * TRB_AHEAD)]);\n",
   "}\n",
-  "#line 1908 \"trbvh.h\"\n",
+  "#line 1910 \"trbvh.h\"\n",
   "TRB_SHARED void trb_settle_task(const trb_collapser *c, TRB_GLOBAL trb_task *task) {\n",
   "  TRB_GLOBAL trbvh_u32 *order = c->words.plane[0] + task->first_ref, *prims = c->words.plane[1] + task->first_ref;\n",
   "  trbvh_u32 waiting = 0, pairs = 0, refs = task->first_ref, prim = 0, max_depth = 0, i;\n",
@@ -1736,7 +1738,7 @@ static const char *const trb_cl_text[] = {
   "    default: trb_make_form(mesh, 4, prims, first, end, out); break;\n",
   "  }\n",
   "}\n",
-  "#line 2086 \"trbvh.h\"\n",
+  "#line 2088 \"trbvh.h\"\n",
   "#define TRB_UNIT 5.9604645e-8f\n",
   "#define TRB_ABS(x) ((x) < 0 ? -(x) : (x))\n",
   "typedef struct trb_ray {\n",
@@ -1814,7 +1816,7 @@ static const char *const trb_cl_text[] = {
   "  along = TRB_MIN(along, 1);\n",
   "  return TRB_MAX(along, 0);\n",
   "}\n",
-  "#line 2170 \"trbvh.h\"\n",
+  "#line 2172 \"trbvh.h\"\n",
   "TRB_CORE int trb_hit_triangle(const TRB_GLOBAL trbvh_triangle *t, const trb_ray *r, float tmax, trbvh_hit *hit) {\n",
   "  const int x = r->axis[0], y = r->axis[1], z = r->axis[2];\n",
   "  const trb_corner a = trb_see(t->v0[x], t->v0[y], t->v0[z], r);\n",
@@ -1855,7 +1857,7 @@ static const char *const trb_cl_text[] = {
   "  hit->u = hit->v = 0;\n",
   "  hit->prim = hit->instance = TRBVH_NONE;\n",
   "}\n",
-  "#line 2214 \"trbvh.h\"\n",
+  "#line 2216 \"trbvh.h\"\n",
   "TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbvh_triangle *triangles,\n",
   "                       const trb_ray *r, int any, trbvh_hit *hit) {\n",
   "  trbvh_u32 stack_node[TRBVH_MAX_DEPTH], height = 0, node = 0, i;\n",
@@ -3038,9 +3040,9 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "#endif\n",
 };
-#define TRB_CL_CORE_LINES 1850u   /* entries of trb_cl_text for user kernels: types, core, traversal */
-#define TRB_CL_LINES      2920u   /* all entries */
-#define TRB_CL_HASH       "9117c4b71ba053bc"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_CORE_LINES 1852u   /* entries of trb_cl_text for user kernels: types, core, traversal */
+#define TRB_CL_LINES      2922u   /* all entries */
+#define TRB_CL_HASH       "eb11a42b9acc3457"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
