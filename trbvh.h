@@ -1130,7 +1130,7 @@ TRB_SHARED trbvh_u32 trb_split_reference(const trb_mesh *mesh, trb_grid grid, tr
 #define TRB_DIGITS     (1u << TRB_DIGIT_BITS)
 #define TRB_SMALL_SORT 4096u             /* so few keys are sorted by digits of 8 bits, as counters take time, too ... */
 #define TRB_TINY_SORT  48u               /* ... and so few by insertion */
-#define TRB_SORT_BLOCK 65536u            /* keys a job counts and scatters */
+#define TRB_SORT_BLOCK 65536u            /* keys a job counts and scatters at most; fewer where that makes fewer than 8 jobs */
 /* More packed keys than a cache holds: by the first digit first, into buckets; then each of these by itself. */
 #ifndef TRB_LARGE_SORT                   /* lower in a test */
   #define TRB_LARGE_SORT 131072u         /* more than TRB_SMALL_SORT */
@@ -2574,6 +2574,8 @@ static double trb_ms(void) {
 #define TRB_ROUNDS_MAX 28                /* of treelets: the last one's gamma is more than any tree has references */
 #define TRB_NODE_BYTES sizeof(trbvh_node)
 
+#define TRB_READ_BLOCK 4096u             /* primitives a job reads, or makes triangles of */
+
 /* What one block of primitives came to. */
 typedef struct trb_block {
   trbvh_node bounds;                     /* of the references; min > max where there are none */
@@ -2743,7 +2745,7 @@ static size_t trb_lay_out(trb_build *b, char *base) {
   TRB_PART(keys,       trb_u64,    n * 8)
   TRB_PART(sorted,     trb_u64,    n * 8)
   TRB_PART(nodes,      trbvh_node, (n * 2 + 2) * TRB_NODE_BYTES)
-  TRB_PART(blocks,     trb_block,  blocks * sizeof(trb_block))
+  TRB_PART(blocks,     trb_block,  trb_blocks(b->input.count, TRB_READ_BLOCK) * sizeof(trb_block))
   TRB_PART(ranges,     trb_range,  blocks * sizeof(trb_range))
   TRB_PART(groups,     trb_group,  TRB_GROUPS_MAX(n) * sizeof(trb_group))
   TRB_PART(tasks,      trb_task,   TRB_TASKS_MAX(n) * sizeof(trb_task))
@@ -2819,7 +2821,7 @@ static void trb_guess_job(void *context, uint32_t index) {
  * guess is right. */
 static void trb_read_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
-  uint32_t first = index * TRB_BLOCK, end = TRB_MIN(b->input.count, first + TRB_BLOCK), i, k, n, good, vertex;
+  uint32_t first = index * TRB_READ_BLOCK, end = TRB_MIN(b->input.count, first + TRB_READ_BLOCK), i, k, n, good, vertex;
   trb_u64 key[TRB_ROW];
   trb_block block;
   trb_row row, all;
@@ -2881,7 +2883,7 @@ static trbvh_result trb_read(trb_build *b) {
   trbvh_node guess = trb_no_box(), bounds;
   uint32_t i;
   int k, equal = 1;
-  b->block_count = trb_blocks(b->input.count, TRB_BLOCK);
+  b->block_count = trb_blocks(b->input.count, TRB_READ_BLOCK);
   b->guessed = b->input.indices && b->input.position_count <= b->input.count && !b->split_max;
   if (b->guessed) {
     if (trb_run(&b->runner, b->block_count, trb_guess_job, b)) return TRBVH_CANCELLED;
@@ -2963,7 +2965,7 @@ static trb_u64 trb_find_scale(trb_build *b) {
 static void trb_split_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
   trb_block *block = &b->blocks[index];
-  uint32_t first = index * TRB_BLOCK, end = TRB_MIN(b->input.count, first + TRB_BLOCK), slot = block->start, i;
+  uint32_t first = index * TRB_READ_BLOCK, end = TRB_MIN(b->input.count, first + TRB_READ_BLOCK), slot = block->start, i;
   block->refs = 0;
   for (i = first; i < end; i++) {
     uint32_t splits = (uint32_t)trb_splits(b->priorities[i], b->priority_unit, b->scale), count;
@@ -3059,16 +3061,34 @@ static int trb_make_high_keys(trb_build *b) {
   return trb_run(&b->runner, trb_blocks(b->ref_count, TRB_BLOCK), trb_high_key_job, b);
 }
 
+/* What a job counts and scatters. */
+typedef struct trb_sort_part { uint32_t first, count, *histogram; } trb_sort_part;
+
+/* Jobs of one size, as many as divide well among threads, but no more than blocks of TRB_BLOCK. */
+static uint32_t trb_sort_jobs(const trb_build *b) {
+  const uint32_t jobs = (trb_blocks(b->ref_count, TRB_SORT_BLOCK) + 7) & ~7u, most = trb_blocks(b->ref_count, TRB_BLOCK);
+  return TRB_MIN(jobs, most);
+}
+
+static trb_sort_part trb_find_sort_part(const trb_build *b, uint32_t index) {
+  const uint32_t size = trb_blocks(b->ref_count, trb_sort_jobs(b));
+  trb_sort_part part;
+  part.first = TRB_MIN(index * size, b->ref_count);
+  part.count = TRB_MIN(b->ref_count - part.first, size);
+  part.histogram = b->histograms + (size_t)index * b->digits;
+  return part;
+}
+
 static void trb_histogram_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
-  uint32_t first = index * TRB_SORT_BLOCK, count = TRB_MIN(b->ref_count - first, TRB_SORT_BLOCK);
-  trb_count_digits(b->keys + first, count, b->digit_shift, b->digits, b->histograms + (size_t)index * b->digits);
+  const trb_sort_part part = trb_find_sort_part(b, index);
+  trb_count_digits(b->keys + part.first, part.count, b->digit_shift, b->digits, part.histogram);
 }
 
 static void trb_scatter_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
-  uint32_t first = index * TRB_SORT_BLOCK, count = TRB_MIN(b->ref_count - first, TRB_SORT_BLOCK);
-  trb_scatter_keys(b->keys + first, count, b->digit_shift, b->digits, b->histograms + (size_t)index * b->digits, b->sorted);
+  const trb_sort_part part = trb_find_sort_part(b, index);
+  trb_scatter_keys(b->keys + part.first, part.count, b->digit_shift, b->digits, part.histogram, b->sorted);
 }
 
 static void trb_sort_by_insertion(trb_u64 *keys, uint32_t count, uint32_t shift) {
@@ -3082,7 +3102,7 @@ static void trb_sort_by_insertion(trb_u64 *keys, uint32_t count, uint32_t shift)
 
 /* By bits [shift, shift + bits) of the keys, which are in order of those below. */
 static int trb_sort(trb_build *b, uint32_t shift, uint32_t bits) {
-  const uint32_t blocks = trb_blocks(b->ref_count, TRB_SORT_BLOCK);
+  const uint32_t jobs = trb_sort_jobs(b);
   const uint32_t digit_bits = b->ref_count > TRB_SMALL_SORT ? TRB_DIGIT_BITS : 8;
   if (b->ref_count <= TRB_TINY_SORT) {
     trb_sort_by_insertion(b->keys, b->ref_count, shift);
@@ -3091,9 +3111,9 @@ static int trb_sort(trb_build *b, uint32_t shift, uint32_t bits) {
   b->digits = 1u << digit_bits;
   for (b->digit_shift = shift; b->digit_shift < shift + bits; b->digit_shift += digit_bits) {
     trb_u64 *swap = b->keys;
-    if (trb_run(&b->runner, blocks, trb_histogram_job, b)) return 1;
-    trb_place_digits(b->histograms, blocks, b->digits);
-    if (trb_run(&b->runner, blocks, trb_scatter_job, b)) return 1;
+    if (trb_run(&b->runner, jobs, trb_histogram_job, b)) return 1;
+    trb_place_digits(b->histograms, jobs, b->digits);
+    if (trb_run(&b->runner, jobs, trb_scatter_job, b)) return 1;
     b->keys = b->sorted;
     b->sorted = swap;
   }
@@ -3102,7 +3122,7 @@ static int trb_sort(trb_build *b, uint32_t shift, uint32_t bits) {
 
 /* Where the keys with each first digit end, once trb_sort has sorted by that. */
 static const uint32_t *trb_bucket_ends(const trb_build *b) {
-  return b->histograms + (size_t)(trb_blocks(b->ref_count, TRB_SORT_BLOCK) - 1) * b->digits;
+  return b->histograms + (size_t)(trb_sort_jobs(b) - 1) * b->digits;
 }
 
 /* Sorts a bucket's keys by the bits below their first digit, in a cache, with an even number of passes. */
@@ -3273,12 +3293,12 @@ static trbvh_result trb_emit(trb_build *b, trbvh *bvh) {
 // ---- Triangles ----
 static void trb_triangle_job(void *context, uint32_t index) {
   const trb_build *b = (const trb_build *)context;
-  const uint32_t first = index * TRB_BLOCK, end = TRB_MIN(b->tree.ref_count, first + TRB_BLOCK);
+  const uint32_t first = index * TRB_READ_BLOCK, end = TRB_MIN(b->tree.ref_count, first + TRB_READ_BLOCK);
   trb_make_triangles(&b->input, b->tree.prims, first, end, (trbvh_triangle *)(uintptr_t)b->tree.triangles);
 }
 
 static trbvh_result trb_finish(trb_build *b) {
-  uint32_t jobs = b->tree.triangles ? trb_blocks(b->tree.ref_count, TRB_BLOCK) : 0;
+  uint32_t jobs = b->tree.triangles ? trb_blocks(b->tree.ref_count, TRB_READ_BLOCK) : 0;
   return trb_run(&b->runner, jobs, trb_triangle_job, b) ? TRBVH_CANCELLED : TRBVH_OK;
 }
 
