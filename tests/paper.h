@@ -1,0 +1,74 @@
+/* What the tests of the builders in examples/paper share. Include it after trbvh.h's implementation and test.h. */
+#ifndef TESTS_PAPER_H
+#define TESTS_PAPER_H
+#include "../examples/paper/paper.h"   /* before scenes.h, whose `scene` its variables would hide */
+#include "scenes.h"
+
+typedef struct paper_tree { trbvh bvh; trbvh_stats stats; } paper_tree;
+
+static inline paper_tree paper_test_make(const trbvh_geometry *g, paper_builder *builder, const void *parameters,
+    float split_budget, int rounds)
+{
+  paper_tree t;
+  trbvh_options o;
+  memset(&t, 0, sizeof t);
+  memset(&o, 0, sizeof o);
+  o.split_budget = split_budget;
+  o.treelet_rounds = rounds;
+  o.stats = &t.stats;
+  CHECK(paper_make(&t.bvh, g, &o, builder, parameters) == TRBVH_OK);
+  return t;
+}
+/* By an own walk, and by trbvh_validate. */
+static inline void paper_test_tree(const paper_tree *t, const trbvh_geometry *g, int split)
+{
+  walk_info info;
+  char why[256] = "";
+  int ok = walk_tree(&t->bvh, g, 8, split, &info, why, sizeof why);
+  CHECK_MSG(ok, "%s", why);
+  if (!ok) return;
+  CHECK_MSG(trbvh_validate(&t->bvh, g, why, sizeof why) == TRBVH_OK, "%s", why);
+  double sah = walk_sah(&info, 1.2, 1);
+  if (info.root_area > 0) CHECK_MSG(fabs(t->stats.sah_cost - sah) <= 1e-6 * sah, "stats %g, walk %g", t->stats.sah_cost, sah);
+}
+/* Every scene of up to `most` triangles: a valid tree; the same again; with splits, no more references than allowed. */
+static inline void paper_test_scenes(paper_builder *builder, const void *parameters, float split_budget, int rounds,
+    uint32_t most)
+{
+  for (size_t i = 0; i < SCENE_COUNT; ++i) {
+    scene s;
+    if (QUICK_OR(scene_defs[i].quick, scene_defs[i].full) > most) continue;
+    scene_make(&s, &scene_defs[i]);
+    CONTEXT("scene %s", s.name);
+    trbvh_geometry g = scene_geometry(&s);
+    paper_tree a = paper_test_make(&g, builder, parameters, split_budget, rounds);
+    paper_tree b = paper_test_make(&g, builder, parameters, split_budget, rounds);
+    paper_test_tree(&a, &g, split_budget > 0);
+    CHECK_MSG(same_tree(&a.bvh, &b.bvh), "not the same tree again");
+    CHECK(a.bvh.ref_count <= (1.0 + split_budget) * s.count);
+    trbvh_free(&a.bvh);
+    trbvh_free(&b.bvh);
+    scene_free(&s);
+  }
+  CONTEXT("%s", "");
+}
+/* SAH of a builder's tree of the scene of this name. */
+static inline double paper_test_sah(const char *name, paper_builder *builder, const void *parameters, float split_budget,
+    int rounds)
+{
+  double sah = 0;
+  for (size_t i = 0; i < SCENE_COUNT; ++i) {
+    scene s;
+    if (strcmp(scene_defs[i].name, name)) continue;
+    scene_make(&s, &scene_defs[i]);
+    trbvh_geometry g = scene_geometry(&s);
+    paper_tree t = paper_test_make(&g, builder, parameters, split_budget, rounds);
+    sah = t.stats.sah_cost;
+    trbvh_free(&t.bvh);
+    scene_free(&s);
+  }
+  CHECK_MSG(sah > 0, "no scene %s", name);
+  return sah;
+}
+
+#endif
