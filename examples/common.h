@@ -1419,23 +1419,34 @@ typedef struct ex_scene {
   float haze;                          /* distance at which most of a surface is lost in it; 0 = none */
 } ex_scene;
 
-/* path: NULL = the built-in scene; aspect: width / height of pictures */
+/* aspect: width / height of pictures; 0 where no vertex is finite */
+static inline int ex_scene_of(ex_scene *scene, ex_mesh mesh, float aspect)
+{
+  ex_vec low, high;
+  if (!ex_mesh_bounds(&mesh, &low, &high)) return 0;
+  ex_vec size = ex_sub(high, low), center = ex_mix(low, high, 0.5f);
+  scene->mesh = mesh;
+  scene->up = ex_guess_up(low, high);
+  scene->diagonal = ex_length(size) > 0 ? ex_length(size) : 1;
+  scene->offset = 1e-5f * (scene->diagonal + ex_length(center));
+  scene->camera = ex_camera_fit(&mesh, scene->up, aspect);
+  scene->haze = 0;
+  return 1;
+}
+/* path: NULL = the built-in scene */
 static inline ex_scene ex_scene_load(const char *path, float aspect)
 {
   ex_scene scene;
-  ex_vec low, high;
+  ex_mesh mesh;
   char error[512];
   if (path) {
-    if (!ex_mesh_read(path, &scene.mesh, error, sizeof error)) ex_die("%s", error);
-  } else if (!ex_mesh_demo(&scene.mesh, EX_DEMO_DETAIL)) ex_die("not enough memory");
-  if (!ex_mesh_bounds(&scene.mesh, &low, &high)) ex_die("%s: no vertex is finite", path);
-
-  ex_vec size = ex_sub(high, low), center = ex_mix(low, high, 0.5f);
-  scene.up = ex_guess_up(low, high);
-  scene.diagonal = ex_length(size) > 0 ? ex_length(size) : 1;
-  scene.offset = 1e-5f * (scene.diagonal + ex_length(center));
-  scene.camera = path ? ex_camera_fit(&scene.mesh, scene.up, aspect) : ex_demo_camera(aspect);
-  scene.haze = path ? 0 : 600;
+    if (!ex_mesh_read(path, &mesh, error, sizeof error)) ex_die("%s", error);
+  } else if (!ex_mesh_demo(&mesh, EX_DEMO_DETAIL)) ex_die("not enough memory");
+  if (!ex_scene_of(&scene, mesh, aspect)) ex_die("%s: no vertex is finite", path);
+  if (!path) {
+    scene.camera = ex_demo_camera(aspect);
+    scene.haze = 600;
+  }
   const ex_camera *c = &scene.camera;   /* the sun comes over the viewer's left shoulder */
   ex_vec left = ex_scale(ex_normalize(c->right), -1), behind = ex_scale(c->forward, -1);
   scene.sun = ex_normalize(ex_mad(ex_mad(scene.up, left, 0.9f), behind, 0.35f));

@@ -16,7 +16,7 @@ static inline paper_tree paper_test_make(const trbvh_geometry *g, paper_builder 
   o.split_budget = split_budget;
   o.treelet_rounds = rounds;
   o.stats = &t.stats;
-  CHECK(paper_make(&t.bvh, g, &o, builder, parameters) == TRBVH_OK);
+  CHECK(paper_make(&t.bvh, g, &o, builder, parameters, NULL) == TRBVH_OK);
   return t;
 }
 /* By an own walk, and by trbvh_validate. */

@@ -161,9 +161,10 @@ static inline void paper_read_refs(paper_build *p)
 }
 
 /* Builds with one of these builders, as trbvh_build does with its own. Of the options, split_budget is the room for
- * splits, as a share of the triangles; treelet_rounds, 0 for none, are run on what the builder made. */
+ * splits, as a share of the triangles; treelet_rounds, 0 for none, are run on what the builder made. references, which may
+ * be NULL: how many it made, before leaves merge those of one triangle. */
 static inline trbvh_result paper_make(trbvh *bvh, const trbvh_geometry *geometry, const trbvh_options *options,
-                                      paper_builder *builder, const void *parameters)
+                                      paper_builder *builder, const void *parameters, uint32_t *references)
 {
   paper_build p;
   trbvh_options o = *options;
@@ -199,6 +200,7 @@ static inline trbvh_result paper_make(trbvh *bvh, const trbvh_geometry *geometry
   else trb_hand_over(b, bvh, b->input.count);
   b->stats.ms_total = ex_now_ms() - start;
   if (options->stats) *options->stats = b->stats;
+  if (references) *references = b->ref_count;
   return result;
 }
 

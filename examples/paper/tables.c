@@ -1,0 +1,920 @@
+/* tables.c - the two tables of Karras and Aila (HPG 2013), made again: what trbvh and every builder that the paper compares
+ * with give and cost, on your meshes or on built-in scenes; with the metrics that explain it, the rate of rays when the
+ * build is counted, and Embree's builders, where it is linked. Introduces: all of paper.h's builders.
+ *
+ *   cc -O2 examples/paper/tables.c -o tables -lm -pthread && ./tables --quick
+ *   cc -O2 -DEX_EMBREE=3 examples/paper/tables.c -o tables -lembree3 -lm -pthread     (or 4, and -lembree4)
+ *   ./tables --scenes meshes/ --out results/
+ *
+ * For each scene all trees are made first, then traced in turn, so that noise hits all alike; medians count. All give the
+ * very same hits, which is checked. Needs POSIX, or MinGW.
+ */
+#define _DEFAULT_SOURCE                /* with -std=c99 too: large pages for the library */
+#define TRBVH_THREADS
+#define TRBVH_IMPLEMENTATION
+#include "../../trbvh.h"
+#define EX_PROGRAM "tables"
+#include "../measure.h"
+#include "bittner.h"
+#include "early.h"
+#include "grid.h"
+#include "hlbvh.h"
+#include "hploc.h"
+#include "judge.h"
+#include "kensler.h"
+#include "naive.h"
+#include "ploc.h"
+#include "plot.h"
+#include "sbvh.h"
+#include "sweep.h"
+#ifdef EX_EMBREE
+  #include "embree.h"
+#endif
+
+static const char usage[] =
+  "usage: tables [MESH or FOLDER]... [options]\n"
+  "  MESH            an OBJ, PLY or STL file; a FOLDER stands for all in it; without any, built-in scenes\n"
+  "  --scenes PATH   the same as PATH\n"
+  "  --builders LIST only these, and those that the tables are relative to: names with commas; see below\n"
+  "  --threads N     after 1, instead of one for each processor\n"
+  "  --reps N        repetitions, whose median counts; 5\n"
+  "  --size WxH      rays of each of the five cameras; 128x96\n"
+  "  --samples N     ambient occlusion rays, and as many diffuse ones, from each hit; 8\n"
+  "  --triangles N   of a built-in scene; 100000\n"
+  "  --csv FILE      every scene and builder there, with all columns\n"
+  "  --out FOLDER    writes RESULTS.md there, with its diagrams\n"
+  "  --notes FILE    Markdown to stand at the end of RESULTS.md\n"
+  "  --quick         small built-in scenes, few rays: within a minute\n"
+  "builders:";
+
+// >>builders ------------------------------------------------------------------------------------------------
+enum { FIRST_TABLE = 1, SECOND_TABLE = 2 };
+enum { PERFORMANCE, SAH, BUILD, FIGURES };   /* in per cent of the table's first row */
+#define MATCH_SBVH -2.0f                 /* as many references as it has */
+
+typedef struct builder {
+  const char *name, *key;
+  int tables;
+  paper_builder *make;                 /* NULL: trbvh_build */
+  const void *parameters;
+  int quality, rounds;
+  float splits;                        /* references more, as a share of the triangles; below 0: none */
+  double expected;                     /* ns a triangle, for the time that is left */
+  double paper[2][FIGURES];            /* by table; 0: not known, or not in it */
+} builder;
+
+static const paper_bittner_settings from_sweep = {.start = paper_sweep};
+#ifdef EX_EMBREE
+static const paper_embree_settings embree_low = {RTC_BUILD_QUALITY_LOW, 4, 4};
+static const paper_embree_settings embree_medium = {RTC_BUILD_QUALITY_MEDIUM, 1, 8};
+static const paper_embree_settings embree_high = {RTC_BUILD_QUALITY_HIGH, 1, 8};
+#endif
+/* The rows of the tables, in their order. The paper's figures: its tables 1 and 2. */
+static const builder builders[] = {
+  {"SweepSAH", "sweep", FIRST_TABLE, paper_sweep, NULL, 0, 0, -1, 3500, {{100, 100, 100}, {0}}},
+  {"TRBVH", "trbvh", FIRST_TABLE | SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, -1, 200, {{96.0, 94.4, 1.03}, {76.5, 111.5, 0.14}}},
+  {"LBVH", "lbvh", FIRST_TABLE, NULL, NULL, TRBVH_QUALITY_FAST, 0, -1, 60, {{69.4, 131.5, 0.28}, {0}}},
+  {"HLBVH", "hlbvh", FIRST_TABLE, paper_hlbvh, NULL, 0, 0, -1, 300, {{67.4, 129.3, 0.57}, {0}}},
+  {"GridSAH", "grid", FIRST_TABLE, paper_grid, NULL, 0, 0, -1, 500, {{68.1, 129.1, 0.70}, {0}}},
+  {"Kensler, climbing", "climb", FIRST_TABLE, paper_kensler_climb, NULL, 0, 0, -1, 3000, {{91.5, 99.6, 552.26}, {0}}},
+  {"Kensler, annealing", "anneal", FIRST_TABLE, paper_kensler_anneal, NULL, 0, 0, -1, 20000, {{0}, {0}}},
+  {"Bittner", "bittner", FIRST_TABLE, paper_bittner, NULL, 0, 0, -1, 15000, {{103.3, 87.7, 1083.24}, {0}}},
+  {"Bittner on SweepSAH", "bittner-sweep", FIRST_TABLE, paper_bittner, &from_sweep, 0, 0, -1, 15000, {{0}, {0}}},
+  {"PLOC", "ploc", FIRST_TABLE, paper_ploc, NULL, 0, 0, -1, 800, {{0}, {0}}},
+  {"H-PLOC", "hploc", FIRST_TABLE, paper_hploc, NULL, 0, 0, -1, 800, {{0}, {0}}},
+#ifdef EX_EMBREE
+  {"Embree LOW", "embree-low", FIRST_TABLE, paper_embree, &embree_low, 0, 0, -1, 200, {{0}, {0}}},
+  {"Embree MEDIUM", "embree-medium", FIRST_TABLE, paper_embree, &embree_medium, 0, 0, -1, 600, {{0}, {0}}},
+#endif
+  {"SBVH", "sbvh", SECOND_TABLE, paper_sbvh, NULL, 0, 0, 2, 6000, {{0}, {100, 100, 100}}},
+  {"TRBVH, 10 % splits", "trbvh-10", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, 0.1f, 300, {{0}, {87.2, 108.8, 0.15}}},
+  {"TRBVH, 30 %", "trbvh-30", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, 0.3f, 350, {{0}, {91.0, 108.0, 0.17}}},
+  {"TRBVH, 50 %", "trbvh-50", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, 0.5f, 400, {{0}, {92.5, 108.3, 0.20}}},
+  {"TRBVH, as SBVH", "trbvh-match", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, MATCH_SBVH, 400, {{0}, {90.7, 107.4, 0.16}}},
+  {"ESC, as SBVH", "esc", SECOND_TABLE, paper_esc, NULL, 0, 3, MATCH_SBVH, 1500, {{0}, {0}}},
+  {"EVH, as SBVH", "evh", SECOND_TABLE, paper_evh, NULL, 0, 3, MATCH_SBVH, 1500, {{0}, {0}}},
+#ifdef EX_EMBREE
+  {"Embree HIGH", "embree-high", SECOND_TABLE, paper_embree, &embree_high, 0, 0, 0.3f, 4500, {{0}, {0}}},
+#endif
+};
+enum { BUILDERS = sizeof builders / sizeof *builders, TURNS = 2, REPS_MAX = 99 };
+#ifdef EX_EMBREE
+static const char *const peer_names[] = {"Embree scene LOW", "Embree scene MEDIUM", "Embree scene HIGH"};
+enum { PEERS = 3 };
+#else
+static const char *const peer_names[] = {""};
+enum { PEERS = 0 };
+#endif
+
+/* Of one builder and one scene. */
+typedef struct result {
+  int made;                            /* 0: not asked for, or it failed */
+  trbvh_stats stats;                   /* with one thread */
+  double ms[TURNS];                    /* 0: it uses no threads */
+  double rates[TURNS][EX_KINDS];       /* million rays/s; 0: not measured */
+  double epo;
+  paper_visits visits;                 /* by diffuse rays */
+  uint32_t references;                 /* that the builder made */
+} result;
+typedef struct scene_results {
+  const char *name;
+  double triangles;
+  size_t rays[EX_KINDS];
+  result rows[BUILDERS];
+  result peers[PEERS + 1];             /* Embree's own scenes */
+} scene_results;
+
+typedef struct tables {
+  const char *csv_path, *out, *notes;
+  int reps, quick, turns;
+  uint32_t threads[TURNS], triangles, width, height, samples;
+  int wanted[BUILDERS];
+  ex_inputs inputs;
+  scene_results *scenes;
+  ex_progress progress;                /* in ns of expected work */
+  double naive_us, dp_us;              /* a treelet; 0: not measured */
+} tables;
+
+static int base_of(int table)          /* the row that a table is relative to */
+{
+  for (int i = 0;; i++) {
+    if (!strcmp(builders[i].key, table == FIRST_TABLE ? "sweep" : "sbvh")) return i;
+  }
+}
+static double rays_ns(const tables *t)   /* expected for all rays of one tree */
+{
+  double rays = (double)t->width * t->height * PAPER_CAMERAS * (1 + 2.0 * t->samples);
+  return rays * 700 * (t->reps + 1) * (t->turns > 1 ? 1 + 1.0 / t->threads[1] : 1);
+}
+static double expected_ns(const tables *t, double triangles)
+{
+  double ns = 0;
+  for (int i = 0; i < BUILDERS; i++) ns += t->wanted[i] ? triangles * builders[i].expected + rays_ns(t) : 0;
+  return ns;
+}
+
+// >>building ------------------------------------------------------------------------------------------------
+static trbvh_options options_of(const builder *of, const scene_results *s, trbvh_stats *stats)
+{
+  trbvh_options options = {.quality = (trbvh_quality)of->quality, .treelet_rounds = of->rounds, .split_budget = of->splits,
+                           .stats = stats};
+  if (of->splits == MATCH_SBVH) {
+    double more = s->rows[base_of(SECOND_TABLE)].references / s->triangles - 1;
+    options.split_budget = more > 0 ? (float)more : -1;
+  }
+  return options;
+}
+/* Of trbvh's own: as an engine does that rebuilds, into the same tree with its memory kept. Median of the repetitions. */
+static double build_own(const tables *t, trbvh *tree, const trbvh_geometry *geometry, trbvh_options options, uint32_t threads)
+{
+  double ms[REPS_MAX];
+  options.jobs.width = threads;
+  trbvh_bytes_bound(geometry, &options, &options.scratch_size);
+  options.scratch = ex_allocate(options.scratch_size, 1);
+  for (int i = -1; i < t->reps; i++) {   /* the first one, which touches fresh memory, does not count */
+    double start = ex_now_ms();
+    ex_check(trbvh_build(tree, geometry, &options), "building", options.stats);
+    if (i >= 0) ms[i] = ex_now_ms() - start;
+  }
+  free(options.scratch);
+  return ex_median(ms, t->reps);
+}
+/* Of the others: again only where it is fast. */
+static double build_other(const tables *t, const builder *of, trbvh *tree, const trbvh_geometry *geometry,
+                          const trbvh_options *options, result *r)
+{
+  double ms[REPS_MAX], all = 0;
+  int count = 0;
+  do {
+    double start = ex_now_ms();
+    ex_check(paper_make(tree, geometry, options, of->make, of->parameters, &r->references), of->name, options->stats);
+    all += ms[count++] = ex_now_ms() - start;
+#ifdef EX_EMBREE
+    if (of->make == paper_embree) ms[count - 1] = paper_embree_ms;   /* without our conversion; below 0 where it failed */
+#endif
+  } while (count < t->reps && all < 300);
+  return ex_median(ms, count);
+}
+static void build(const tables *t, int row, trbvh *tree, const trbvh_geometry *geometry, scene_results *s)
+{
+  const builder *of = &builders[row];
+  result *r = &s->rows[row];
+  trbvh_options options = options_of(of, s, &r->stats);
+  if (of->make) {
+    r->ms[0] = build_other(t, of, tree, geometry, &options, r);
+  } else {
+    trbvh_stats stats;
+    if (t->turns > 1) {
+      options.stats = &stats;
+      r->ms[1] = build_own(t, tree, geometry, options, t->threads[1]);
+      options.stats = &r->stats;
+    }
+    r->ms[0] = build_own(t, tree, geometry, options, 1);
+    r->references = r->stats.ref_count;
+  }
+  r->made = r->ms[0] > 0;
+}
+
+/* The same best topology found in two ways, on treelets of the first scene. */
+static void measure_treelets(tables *t)
+{
+  (void)t;
+}
+
+// >>tracing -------------------------------------------------------------------------------------------------
+/* What the rays hit, by the first tree, and room for what they hit by another one. */
+typedef struct answers { trbvh_hit *hits[EX_KINDS], *again; uint8_t *occluded, *occluded_again; } answers;
+
+static double trace_ms(const trbvh *tree, int kind, const ex_ray_set *set, uint32_t threads, trbvh_hit *hits, uint8_t *occluded)
+{
+  trbvh_options options = {.jobs = {.width = threads}};
+  double start = ex_now_ms();
+  trbvh_result done = kind == EX_AMBIENT ? trbvh_occluded_n(tree, set->rays, occluded, set->count, &options)
+                                         : trbvh_intersect_n(tree, set->rays, hits, set->count, &options);
+  double ms = ex_now_ms() - start;
+  ex_check(done, "tracing rays", NULL);
+  return ms;
+}
+static answers make_answers(const trbvh *tree, const ex_ray_set sets[EX_KINDS])
+{
+  answers a;
+  size_t most = 0;
+  for (int kind = 0; kind < EX_KINDS; kind++) {
+    a.hits[kind] = (trbvh_hit *)ex_allocate(sets[kind].count, sizeof(trbvh_hit));
+    if (sets[kind].count > most) most = sets[kind].count;
+  }
+  a.again = (trbvh_hit *)ex_allocate(most, sizeof(trbvh_hit));
+  a.occluded = (uint8_t *)ex_allocate(most, 1);
+  a.occluded_again = (uint8_t *)ex_allocate(most, 1);
+  for (int kind = 0; kind < EX_KINDS; kind++) trace_ms(tree, kind, &sets[kind], 1, a.hits[kind], a.occluded);
+  return a;
+}
+static void free_answers(answers *a)
+{
+  for (int kind = 0; kind < EX_KINDS; kind++) free(a->hits[kind]);
+  free(a->again);
+  free(a->occluded);
+  free(a->occluded_again);
+}
+static void check_answers(const answers *a, int kind, size_t count, const char *who)
+{
+  if (kind == EX_AMBIENT ? memcmp(a->occluded, a->occluded_again, count)
+                         : memcmp(a->hits[kind], a->again, count * sizeof(trbvh_hit))) {
+    ex_die("%s: other hits than with the first tree", who);
+  }
+}
+/* All trees with all kinds of rays; a first round, that does not count, warms up. */
+static void trace(tables *t, const trbvh *trees, const ex_ray_set sets[EX_KINDS], answers *a, scene_results *s)
+{
+  static double ms[BUILDERS][EX_KINDS][REPS_MAX];
+  for (int turn = 0; turn < t->turns; turn++) {
+    for (int rep = -1; rep < t->reps; rep++) {
+      for (int i = 0; i < BUILDERS * EX_KINDS; i++) {
+        int row = i / EX_KINDS, kind = i % EX_KINDS;
+        if (!s->rows[row].made || !sets[kind].count) continue;
+        double once = trace_ms(&trees[row], kind, &sets[kind], t->threads[turn], a->again, a->occluded_again);
+        check_answers(a, kind, sets[kind].count, builders[row].name);
+        if (rep >= 0) ms[row][kind][rep] = once;
+        t->progress.done += rays_ns(t) / (EX_KINDS * t->turns * (t->reps + 1));
+      }
+      ex_show_progress(&t->progress, s->name, 1);
+    }
+    for (int i = 0; i < BUILDERS * EX_KINDS; i++) {
+      int row = i / EX_KINDS, kind = i % EX_KINDS;
+      if (!s->rows[row].made || !sets[kind].count) continue;
+      s->rows[row].rates[turn][kind] = (double)sets[kind].count / ex_median(ms[row][kind], t->reps) / 1e3;
+    }
+  }
+}
+#ifdef EX_EMBREE
+/* What an Embree user gets: its own scene, nodes and traversal. */
+static void measure_peers(const tables *t, const ex_mesh *mesh, const ex_ray_set sets[EX_KINDS], answers *a, scene_results *s)
+{
+  static const enum RTCBuildQuality qualities[PEERS] = {RTC_BUILD_QUALITY_LOW, RTC_BUILD_QUALITY_MEDIUM, RTC_BUILD_QUALITY_HIGH};
+  for (int i = 0; i < PEERS * t->turns; i++) {
+    int turn = i / PEERS, peer = i % PEERS;
+    uint32_t threads = t->threads[turn];
+    ex_embree_scene scene = ex_embree_scene_make(mesh, qualities[peer], threads);
+    s->peers[peer].made = 1;
+    s->peers[peer].ms[turn] = scene.build_ms;
+    for (int kind = 0; kind < EX_KINDS; kind++) {
+      double ms[REPS_MAX];
+      for (int rep = -1; rep < t->reps; rep++) {
+        double once = ex_embree_trace(&scene, sets[kind].rays, sets[kind].count, threads, kind == EX_AMBIENT, a->again,
+                                      a->occluded_again);
+        if (rep >= 0) ms[rep] = once;
+      }
+      if (sets[kind].count) s->peers[peer].rates[turn][kind] = (double)sets[kind].count / ex_median(ms, t->reps) / 1e3;
+    }
+    ex_embree_scene_free(&scene);
+  }
+}
+#endif
+
+static void measure_scene(tables *t, const ex_input *in, scene_results *s)
+{
+  trbvh trees[BUILDERS], first = {0};
+  ex_scene scene;
+  ex_ray_set sets[EX_KINDS];
+  memset(trees, 0, sizeof trees);
+  ex_mesh mesh = ex_load_input(in, t->triangles);
+  ex_scene_of(&scene, mesh, 1);
+  trbvh_geometry geometry = ex_mesh_geometry(&mesh);
+  s->name = ex_short_name(in);
+  s->triangles = mesh.triangle_count;
+  double done = t->progress.done;
+  ex_show_progress(&t->progress, s->name, 0);
+  for (int i = -1, sbvh = base_of(SECOND_TABLE); i < BUILDERS; i++) {   /* SBVH first: others match its references */
+    int row = i < 0 ? sbvh : i;
+    if (i == sbvh || !t->wanted[row]) continue;
+    build(t, row, &trees[row], &geometry, s);
+    t->progress.done += s->triangles * builders[row].expected;
+    ex_show_progress(&t->progress, s->name, 1);
+  }
+  ex_check(trbvh_build(&first, &geometry, NULL), "building", NULL);
+  paper_make_rays(&scene, &first, t->width, t->height, t->samples, sets);
+  paper_points points = paper_make_points(&mesh, t->quick ? 4096 : 32768);
+  answers a = make_answers(&first, sets);
+  for (int i = 0; i < EX_KINDS; i++) s->rays[i] = sets[i].count;
+  trace(t, trees, sets, &a, s);
+  for (int i = 0; i < BUILDERS; i++) {
+    if (!s->rows[i].made) continue;
+    size_t step = sets[EX_DIFFUSE].count / 20000 + 1;
+    s->rows[i].epo = paper_epo(&trees[i], &points);
+    s->rows[i].visits = paper_count_visits(&trees[i], sets[EX_DIFFUSE].rays, a.hits[EX_DIFFUSE], sets[EX_DIFFUSE].count, step);
+    trbvh_free(&trees[i]);
+  }
+#ifdef EX_EMBREE
+  measure_peers(t, &mesh, sets, &a, s);
+#endif
+  t->progress.done = done + expected_ns(t, s->triangles);
+  for (int i = 0; i < EX_KINDS; i++) free(sets[i].rays);
+  free(points.at);
+  free_answers(&a);
+  trbvh_free(&first);
+  ex_mesh_free(&mesh);
+}
+
+// >>figures -------------------------------------------------------------------------------------------------
+static int in_table(const tables *t, int row, int table) { return t->wanted[row] && (builders[row].tables & table); }
+
+/* Of all scenes; 0 where one of them has none. */
+typedef double measure(const scene_results *s, int row, int table);
+static double mean(const tables *t, measure *of, int row, int table)
+{
+  double sum = 0;
+  for (size_t i = 0; i < t->inputs.count; i++) {
+    double value = t->scenes[i].rows[row].made ? of(&t->scenes[i], row, table) : 0;
+    if (!(value > 0)) return 0;
+    sum += value;
+  }
+  return sum / (double)t->inputs.count;
+}
+static double geometric_mean(const tables *t, measure *of, int row, int table)
+{
+  double sum = 0;
+  for (size_t i = 0; i < t->inputs.count; i++) {
+    double value = t->scenes[i].rows[row].made ? of(&t->scenes[i], row, table) : 0;
+    if (!(value > 0)) return 0;
+    sum += log(value);
+  }
+  return exp(sum / (double)t->inputs.count);
+}
+static double ratio(double a, double b) { return b > 0 ? 100 * a / b : 0; }
+static double rate_per_cent(const scene_results *s, int row, int table, int turn, int kind)
+{
+  return ratio(s->rows[row].rates[turn][kind], s->rows[base_of(table)].rates[turn][kind]);
+}
+static double performance(const scene_results *s, int row, int table) { return rate_per_cent(s, row, table, 0, EX_DIFFUSE); }
+static double performance_n(const scene_results *s, int row, int table) { return rate_per_cent(s, row, table, 1, EX_DIFFUSE); }
+static double primary(const scene_results *s, int row, int table) { return rate_per_cent(s, row, table, 0, EX_PRIMARY); }
+static double ambient(const scene_results *s, int row, int table) { return rate_per_cent(s, row, table, 0, EX_AMBIENT); }
+static double sah(const scene_results *s, int row, int table)
+{
+  return ratio(s->rows[row].stats.sah_cost, s->rows[base_of(table)].stats.sah_cost);
+}
+static double build_time(const scene_results *s, int row, int table)
+{
+  return ratio(s->rows[row].ms[0], s->rows[base_of(table)].ms[0]);
+}
+static double references(const scene_results *s, int row, int table)
+{
+  (void)table;
+  return 100 * s->rows[row].stats.ref_count / s->triangles;
+}
+static double epo(const scene_results *s, int row, int table) { return ratio(s->rows[row].epo, s->rows[base_of(table)].epo); }
+static double lcv(const scene_results *s, int row, int table)
+{
+  return ratio(s->rows[row].visits.lcv, s->rows[base_of(table)].visits.lcv);
+}
+static double nodes(const scene_results *s, int row, int table)
+{
+  return ratio(s->rows[row].visits.nodes, s->rows[base_of(table)].visits.nodes);
+}
+static double triangles(const scene_results *s, int row, int table)
+{
+  return ratio(s->rows[row].visits.triangles, s->rows[base_of(table)].visits.triangles);
+}
+static double depth(const scene_results *s, int row, int table) { (void)table; return s->rows[row].stats.max_depth; }
+static double ns_per_triangle(const scene_results *s, int row, int table)
+{
+  (void)table;
+  return s->rows[row].ms[0] * 1e6 / s->triangles;
+}
+static double ns_per_triangle_n(const scene_results *s, int row, int table)
+{
+  (void)table;
+  return s->rows[row].ms[1] * 1e6 / s->triangles;
+}
+static double million_rays(const scene_results *s, int row, int table) { (void)table; return s->rows[row].rates[0][EX_DIFFUSE]; }
+static double million_rays_n(const scene_results *s, int row, int table) { (void)table; return s->rows[row].rates[1][EX_DIFFUSE]; }
+
+/* Million rays/s when `rays` of them are traced and the build is counted, with one thread: R / (build + R / p). */
+static double effective(const result *r, double rays)
+{
+  double p = r->rates[0][EX_DIFFUSE];
+  return p > 0 ? rays / (r->ms[0] * 1e3 + rays / p) : 0;
+}
+static double effective_mean(const tables *t, int row, double rays)
+{
+  double sum = 0;
+  for (size_t i = 0; i < t->inputs.count; i++) {
+    double rate = effective(&t->scenes[i].rows[row], rays);
+    if (!(rate > 0)) return 0;
+    sum += log(rate);
+  }
+  return exp(sum / (double)t->inputs.count);
+}
+/* How many rays it takes until the slower build b has paid against a; infinity where it never does. */
+static double break_even(const result *a, const result *b)
+{
+  double per_ray = 1 / a->rates[0][EX_DIFFUSE] - 1 / b->rates[0][EX_DIFFUSE];
+  return per_ray > 0 ? (b->ms[0] - a->ms[0]) * 1e3 / per_ray : HUGE_VAL;
+}
+
+// >>report --------------------------------------------------------------------------------------------------
+/* Markdown, for the terminal as well: cells have a width. */
+static void print_cell(FILE *out, int width, int decimals, double value)   /* blank where it is not known */
+{
+  if (!(value > 0)) fprintf(out, " %*s |", width, "");
+  else fprintf(out, " %*.*f |", width, value >= 1000 ? 0 : decimals, value);
+}
+static void print_rule(FILE *out, int first, int count, int width)
+{
+  fprintf(out, "\n|%.*s|", first + 2, "----------------------------------------");
+  for (int i = 0; i < count; i++) fprintf(out, "%.*s:|", width + 1, "----------------------------------------");
+  fputs("\n", out);
+}
+enum { NAME = 19 };                      /* width of a builder's name */
+
+static void print_machine(FILE *out, const tables *t)
+{
+  char line[256], cpu[256] = "unknown processor";
+  FILE *info = fopen("/proc/cpuinfo", "r");
+  while (info && fgets(line, sizeof line, info)) {
+    char *value = strstr(line, ": ");
+    if (strncmp(line, "model name", 10) || !value) continue;
+    snprintf(cpu, sizeof cpu, "%.*s", (int)strcspn(value + 2, "\n"), value + 2);
+    break;
+  }
+  if (info) fclose(info);
+#ifdef __VERSION__
+  const char *compiler = __VERSION__;
+#else
+  const char *compiler = "unknown compiler";
+#endif
+  fprintf(out, "\n%s, %u threads; compiler %s; %u scenes; %ux%u rays from each of %d cameras, %u + %u from each hit; medians of "
+          "%d.\n", cpu, (unsigned)t->threads[t->turns - 1], compiler, (unsigned)t->inputs.count, (unsigned)t->width,
+          (unsigned)t->height, PAPER_CAMERAS, (unsigned)t->samples, (unsigned)t->samples, t->reps);
+}
+/* As the paper's: averages over the scenes. */
+static void print_table(FILE *out, const tables *t, int table)
+{
+  static measure *const figures[FIGURES] = {performance, sah, build_time};
+  fprintf(out, "\n### Relative to %s, average\n\n| %-*s | performance | paper | SAH | paper | build | paper | refs |",
+          builders[base_of(table)].name, NAME, "%");
+  print_rule(out, NAME, 7, 6);
+  for (int row = 0; row < BUILDERS; row++) {
+    if (!in_table(t, row, table)) continue;
+    fprintf(out, "| %-*s |", NAME, builders[row].name);
+    for (int i = 0; i < FIGURES; i++) {
+      print_cell(out, 6, i == BUILD ? 2 : 1, mean(t, figures[i], row, table));
+      print_cell(out, 6, i == BUILD ? 2 : 1, builders[row].paper[table - 1][i]);
+    }
+    print_cell(out, 6, 1, mean(t, references, row, table));
+    fputs("\n", out);
+  }
+}
+typedef struct column { const char *title; measure *of; int decimals, geometric; } column;
+static void print_columns(FILE *out, const tables *t, int table, const column *columns, int count)
+{
+  fprintf(out, "\n| %-*s |", NAME, "");
+  for (int i = 0; i < count; i++) fprintf(out, " %s |", columns[i].title);
+  print_rule(out, NAME, count, 6);
+  for (int row = 0; row < BUILDERS; row++) {
+    if (!in_table(t, row, table)) continue;
+    fprintf(out, "| %-*s |", NAME, builders[row].name);
+    for (int i = 0; i < count; i++) {
+      double value = columns[i].geometric ? geometric_mean(t, columns[i].of, row, table) : mean(t, columns[i].of, row, table);
+      print_cell(out, 6, columns[i].decimals, value);
+    }
+    fputs("\n", out);
+  }
+}
+static void print_metrics(FILE *out, const tables *t, int table)
+{
+  static const column shares[] = {
+    {"primary", primary, 1, 0}, {"ambient occlusion", ambient, 1, 0}, {"diffuse", performance, 1, 0},
+    {"diffuse, all threads", performance_n, 1, 0}, {"SAH", sah, 1, 0}, {"EPO", epo, 1, 1}, {"LCV", lcv, 1, 0},
+    {"nodes/ray", nodes, 1, 0}, {"triangles/ray", triangles, 1, 0}
+  };
+  static const column values[] = {
+    {"depth", depth, 1, 0}, {"build, ns/triangle", ns_per_triangle, 1, 1}, {"all threads", ns_per_triangle_n, 1, 1},
+    {"diffuse, million rays/s", million_rays, 2, 1}, {"all threads", million_rays_n, 2, 1}
+  };
+  const char *base = builders[base_of(table)].name;
+  fprintf(out, "\nRays and what explains them, %% of %s; nodes and triangles of diffuse rays up to their hits:\n", base);
+  print_columns(out, t, table, shares, sizeof shares / sizeof *shares);
+  fputs("\nMean depth; times and rates as geometric means:\n", out);
+  print_columns(out, t, table, values, sizeof values / sizeof *values);
+}
+static void print_scenes(FILE *out, const tables *t, int table, const char *title, measure *of, int decimals)
+{
+  int count = 0;
+  fprintf(out, "\n%s, %% of %s:\n\n| %-24s |", title, builders[base_of(table)].name, "scene");
+  for (int row = 0; row < BUILDERS; row++) {
+    if (!in_table(t, row, table)) continue;
+    fprintf(out, " %s |", builders[row].name);
+    count++;
+  }
+  print_rule(out, 24, count, 6);
+  for (size_t i = 0; i < t->inputs.count; i++) {
+    fprintf(out, "| %-24s |", t->scenes[i].name);
+    for (int row = 0; row < BUILDERS; row++) {
+      const scene_results *s = &t->scenes[i];
+      if (in_table(t, row, table)) print_cell(out, 6, decimals, s->rows[row].made ? of(s, row, table) : 0);
+    }
+    fputs("\n", out);
+  }
+}
+static void print_stages(FILE *out, const tables *t)
+{
+  fprintf(out, "\n### Stages of trbvh's own builds, ns/triangle, one thread, average\n\n"
+          "| %-*s | split | morton | sort | hierarchy | treelets | collapse | finish |", NAME, "");
+  print_rule(out, NAME, 7, 6);
+  for (int row = 0; row < BUILDERS; row++) {
+    double sums[7] = {0};
+    if (!t->wanted[row] || builders[row].make) continue;
+    for (size_t i = 0; i < t->inputs.count; i++) {
+      const scene_results *s = &t->scenes[i];
+      const trbvh_stats *of = &s->rows[row].stats;
+      const double ms[7] = {of->ms_split, of->ms_morton, of->ms_sort, of->ms_hierarchy, of->ms_treelets, of->ms_collapse, of->ms_finish};
+      for (int k = 0; k < 7; k++) sums[k] += ms[k] * 1e6 / s->triangles / (double)t->inputs.count;
+    }
+    fprintf(out, "| %-*s |", NAME, builders[row].name);
+    for (int k = 0; k < 7; k++) print_cell(out, 6, 1, sums[k]);
+    fputs("\n", out);
+  }
+  if (t->naive_us > 0) {
+    fprintf(out, "\nThe best topology of a treelet of seven leaves: %.0f us by the naive recursion (1,149,877 calls), %.3f us by "
+            "the dynamic program: %.0f times as fast.\n", t->naive_us, t->dp_us, t->naive_us / t->dp_us);
+  }
+}
+static int by_value(const void *a, const void *b)
+{
+  double x = *(const double *)a, y = *(const double *)b;
+  return (x > y) - (x < y);
+}
+static void print_rays(FILE *out, double rays)
+{
+  if (rays <= 0) fputs(" at once |", out);
+  else if (rays > 1e15) fputs(" never |", out);
+  else fprintf(out, " %.3g million |", rays / 1e6);
+}
+static void print_break_even(FILE *out, const tables *t)
+{
+  static const char *const pairs[][2] = {
+    {"lbvh", "trbvh"}, {"trbvh", "sweep"}, {"trbvh", "bittner"}, {"trbvh", "trbvh-30"}, {"trbvh-30", "sbvh"}, {"trbvh", "sbvh"}
+  };
+  double *at = (double *)ex_allocate(t->inputs.count, sizeof *at);
+  fputs("\n### From how many rays on a slower build pays, one thread\n\n| | median of the scenes | first | last |\n|---|--:|--:|--:|\n", out);
+  for (size_t k = 0; k < sizeof pairs / sizeof *pairs; k++) {
+    int rows[2] = {0, 0};
+    size_t count = 0;
+    for (int side = 0; side < 2; side++) {
+      while (strcmp(builders[rows[side]].key, pairs[k][side])) rows[side]++;
+    }
+    for (size_t i = 0; i < t->inputs.count; i++) {
+      const result *a = &t->scenes[i].rows[rows[0]], *b = &t->scenes[i].rows[rows[1]];
+      if (a->rates[0][EX_DIFFUSE] > 0 && b->rates[0][EX_DIFFUSE] > 0) at[count++] = break_even(a, b);
+    }
+    if (!count) continue;
+    qsort(at, count, sizeof *at, by_value);
+    fprintf(out, "| %s instead of %s |", builders[rows[1]].name, builders[rows[0]].name);
+    print_rays(out, at[(count - 1) / 2]);
+    print_rays(out, at[0]);
+    print_rays(out, at[count - 1]);
+    fputs("\n", out);
+  }
+  free(at);
+  fputs("\nThe best of all, by the geometric mean of rays per second with the build counted:", out);
+  for (double exponent = 5, best_before = -1; exponent <= 9.0001; exponent += 0.02) {
+    int best = -1;
+    for (int row = 0; row < BUILDERS; row++) {
+      double rate = t->wanted[row] ? effective_mean(t, row, pow(10, exponent)) : 0;
+      if (rate > 0 && (best < 0 || rate > effective_mean(t, best, pow(10, exponent)))) best = row;
+    }
+    if (best < 0 || best == best_before) continue;
+    if (best_before < 0) fprintf(out, " %s", builders[best].name);
+    else fprintf(out, ", from %.3g million rays on %s", pow(10, exponent - 6), builders[best].name);
+    best_before = best;
+  }
+  fputs(".\n", out);
+}
+static void print_peers(FILE *out, const tables *t)
+{
+  if (!PEERS) return;
+  fprintf(out, "\n### Embree as its users get it: scenes of its own, rtcIntersect1 and rtcOccluded1\n\nGeometric means; trbvh's rows for "
+          "comparison. Million rays/s of primary, ambient occlusion and diffuse rays, with one thread and with all.\n\n"
+          "| %-*s | build, ns/triangle | primary | ambient occlusion | diffuse | all threads: build | primary | ambient occlusion "
+          "| diffuse |", NAME, "");
+  print_rule(out, NAME, 8, 6);
+  for (int i = -2; i < PEERS; i++) {
+    fprintf(out, "| %-*s |", NAME, i < 0 ? builders[i + 3].name : peer_names[i]);
+    for (int k = 0; k < TURNS * (1 + EX_KINDS); k++) {
+      int turn = k / (1 + EX_KINDS), kind = k % (1 + EX_KINDS) - 1;
+      double sum = 0;
+      for (size_t m = 0; m < t->inputs.count; m++) {
+        const scene_results *s = &t->scenes[m];
+        const result *r = i < 0 ? &s->rows[i + 3] : &s->peers[i];
+        sum += log(kind < 0 ? r->ms[turn] * 1e6 / s->triangles : r->rates[turn][kind]);
+      }
+      print_cell(out, 6, kind < 0 ? 0 : 2, exp(sum / (double)t->inputs.count));
+    }
+    fputs("\n", out);
+  }
+}
+static void print_report(FILE *out, const tables *t, int with_scenes)
+{
+  print_machine(out, t);
+  for (int table = FIRST_TABLE; table <= SECOND_TABLE; table++) {
+    if (!t->wanted[base_of(table)]) continue;
+    fprintf(out, "\n## Table %d\n", table);
+    print_table(out, t, table);
+    print_metrics(out, t, table);
+    if (!with_scenes) continue;
+    print_scenes(out, t, table, "Performance (diffuse rays)", performance, 1);
+    print_scenes(out, t, table, "SAH", sah, 1);
+    print_scenes(out, t, table, "Build time", build_time, 2);
+    print_scenes(out, t, table, "EPO", epo, 1);
+  }
+  fputs("\n## Builds\n", out);
+  print_stages(out, t);
+  print_break_even(out, t);
+  print_peers(out, t);
+}
+
+// >>files ---------------------------------------------------------------------------------------------------
+static FILE *create(const char *folder, const char *name)
+{
+  char path[1024];
+  snprintf(path, sizeof path, "%s%s%s", folder, *folder ? "/" : "", name);
+  FILE *file = fopen(path, "w");
+  if (!file) ex_die("%s: cannot be written", path);
+  return file;
+}
+static void close_file(FILE *file, const char *name) { if (fclose(file)) ex_die("%s: cannot be written", name); }
+
+static void write_csv(const tables *t)
+{
+  FILE *csv = create("", t->csv_path);
+  fputs("scene,triangles,builder,references,leaves,depth,sah,epo,lcv,nodes_per_ray,triangles_per_ray,build_ms,build_ms_threads,"
+        "split_ms,morton_ms,sort_ms,hierarchy_ms,treelets_ms,collapse_ms,finish_ms,primary_mrays,ambient_mrays,diffuse_mrays,"
+        "primary_mrays_threads,ambient_mrays_threads,diffuse_mrays_threads", csv);
+  for (int k = 5; k <= 9; k++) fprintf(csv, ",effective_mrays_1e%d", k);
+  fputs("\n", csv);
+  for (size_t i = 0; i < t->inputs.count; i++) {
+    for (int row = 0; row < BUILDERS + PEERS; row++) {
+      const scene_results *s = &t->scenes[i];
+      const result *r = row < BUILDERS ? &s->rows[row] : &s->peers[row - BUILDERS];
+      const trbvh_stats *of = &r->stats;
+      const double values[] = {
+        s->triangles, of->ref_count, of->leaf_count, of->max_depth, of->sah_cost, r->epo, r->visits.lcv, r->visits.nodes,
+        r->visits.triangles, r->ms[0], r->ms[1], of->ms_split, of->ms_morton, of->ms_sort, of->ms_hierarchy, of->ms_treelets,
+        of->ms_collapse, of->ms_finish, r->rates[0][0], r->rates[0][1], r->rates[0][2], r->rates[1][0], r->rates[1][1], r->rates[1][2],
+        effective(r, 1e5), effective(r, 1e6), effective(r, 1e7), effective(r, 1e8), effective(r, 1e9)
+      };
+      if (!r->made) continue;
+      fprintf(csv, "\"%s\",%.0f,\"%s\"", s->name, values[0], row < BUILDERS ? builders[row].name : peer_names[row - BUILDERS]);
+      for (size_t k = 1; k < sizeof values / sizeof *values; k++) {
+        if (values[k] > 0) fprintf(csv, ",%.6g", values[k]);
+        else fputs(",", csv);
+      }
+      fputs("\n", csv);
+    }
+  }
+  close_file(csv, t->csv_path);
+}
+
+/* SAH or performance, in per cent of SweepSAH, over build time. */
+static void plot_builders(const tables *t, const char *name, measure *of, const char *title, int more)
+{
+  paper_plot p = {.left = 60, .top = 40, .width = 680, .height = 380};
+  paper_label points[BUILDERS];
+  int count = 0;
+  double slowest = 0, fastest = DBL_MAX, least = DBL_MAX, most = 0;
+  for (int row = 0; row < BUILDERS; row++) {
+    double x = t->wanted[row] ? geometric_mean(t, ns_per_triangle, row, FIRST_TABLE) : 0;
+    double y = x > 0 ? geometric_mean(t, of, row, FIRST_TABLE) : 0;
+    if (!(y > 0)) continue;
+    points[count++] = (paper_label){x, y, builders[row].name, NULL, 0};
+    fastest = fmin(fastest, x);
+    slowest = fmax(slowest, x);
+    least = fmin(least, y);
+    most = fmax(most, y);
+  }
+  p.x = (paper_axis){fastest * 0.7, slowest * 1.5, 1, "build, ns/triangle, one thread (geometric means)"};
+  p.y = (paper_axis){least - 5, most + 5, 0, title};
+  paper_open_plot(&p, name, 780, 470);
+  paper_frame(&p);
+  paper_plot_points(&p, points, count, more);
+  paper_close_plot(&p);
+}
+/* The builders that diagrams with many lines or bars show. */
+static int shown_rows(const tables *t, int rows[BUILDERS])
+{
+  static const char *const keys[] = {"lbvh", "ploc", "trbvh", "bittner", "sweep", "trbvh-30", "sbvh"};
+  int count = 0;
+  for (size_t k = 0; k < sizeof keys / sizeof *keys; k++) {
+    int row = 0;
+    while (strcmp(builders[row].key, keys[k])) row++;
+    if (t->wanted[row]) rows[count++] = row;
+  }
+  return count;
+}
+static void plot_scenes(const tables *t, const char *name)
+{
+  int rows[BUILDERS], count = shown_rows(t, rows);
+  double bar = 7, group = bar * count + 8, most = 100;
+  paper_plot p = {.left = 190, .top = 70, .width = 560, .height = group * (double)t->inputs.count};
+  for (size_t i = 0; i < t->inputs.count; i++) {
+    for (int k = 0; k < count; k++) most = fmax(most, performance(&t->scenes[i], rows[k], FIRST_TABLE));
+  }
+  p.x = (paper_axis){0, most > 300 ? 300 : most * 1.02, 0, "diffuse rays/s, % of SweepSAH"};
+  p.y = (paper_axis){0, 1, 0, ""};
+  paper_open_plot(&p, name, 790, p.height + 120);
+  for (double x = 0; x <= p.x.high; x += 50) paper_tick(&p, 0, x);
+  for (int k = 0; k < count; k++) {
+    double x = 30 + 105 * k, y = 30;
+    fprintf(p.file, "<rect x=\"%.0f\" y=\"%.0f\" width=\"10\" height=\"10\" fill=\"%s\"/>\n", x, y - 9, paper_color(k));
+    paper_text(&p, x + 14, y, "start", "#000000", builders[rows[k]].name);
+  }
+  for (size_t i = 0; i < t->inputs.count; i++) {
+    double top = p.top + group * (double)i;
+    paper_text(&p, p.left - 8, top + group / 2, "end", "#000000", t->scenes[i].name);
+    for (int k = 0; k < count; k++) {
+      double value = performance(&t->scenes[i], rows[k], FIRST_TABLE), x = fmin(value, p.x.high);
+      fprintf(p.file, "<rect x=\"%.0f\" y=\"%.1f\" width=\"%.1f\" height=\"%.1f\" fill=\"%s\"/>\n", p.left, top + 4 + bar * k,
+              p.width * x / p.x.high, bar - 1, paper_color(k));
+      if (value <= x) continue;
+      char text[32];
+      snprintf(text, sizeof text, "%.0f", value);
+      paper_text(&p, p.left + p.width + 4, top + 10 + bar * k, "start", "#000000", text);
+    }
+  }
+  paper_text(&p, p.left + p.width / 2, p.top + p.height + 36, "middle", "#000000", p.x.title);
+  paper_close_plot(&p);
+}
+static void plot_effective(const tables *t, const char *name)
+{
+  int rows[BUILDERS], count = shown_rows(t, rows);
+  paper_plot p = {.left = 60, .top = 40, .width = 560, .height = 380};
+  paper_label labels[BUILDERS];
+  double most = 0;
+  for (int k = 0; k < count; k++) most = fmax(most, effective_mean(t, rows[k], 1e9));
+  p.x = (paper_axis){1e5, 1e9, 1, "diffuse rays for one build"};
+  p.y = (paper_axis){0, most * 1.05, 0, "million rays/s with the build counted, one thread (geometric means)"};
+  paper_open_plot(&p, name, 780, 470);
+  paper_frame(&p);
+  for (int k = 0; k < count; k++) {
+    fprintf(p.file, "<polyline fill=\"none\" stroke-width=\"2\" stroke=\"%s\" points=\"", paper_color(k));
+    for (double x = 5; x <= 9.001; x += 0.05) {
+      fprintf(p.file, "%.1f,%.1f ", paper_x(&p, pow(10, x)), paper_y(&p, effective_mean(t, rows[k], pow(10, x))));
+    }
+    fputs("\"/>\n", p.file);
+    labels[k] = (paper_label){p.left + p.width + 8, paper_y(&p, effective_mean(t, rows[k], 1e9)), builders[rows[k]].name, paper_color(k), 0};
+  }
+  paper_spread(labels, count, 1, 14);
+  for (int k = 0; k < count; k++) paper_text(&p, labels[k].x, labels[k].y + 4, "start", labels[k].color, labels[k].text);
+  paper_close_plot(&p);
+}
+static void copy_notes(FILE *out, const char *path)
+{
+  FILE *notes = fopen(path, "r");
+  if (!notes) ex_die("%s: cannot be opened", path);
+  fputs("\n", out);
+  for (int c; (c = fgetc(notes)) != EOF;) fputc(c, out);
+  fclose(notes);
+}
+static void write_results(const tables *t)
+{
+  static const char *const plots[][2] = {
+    {"sah.svg", "SAH and build time of each builder; the front joins those that no other one beats in both"},
+    {"performance.svg", "Diffuse rays and build time, likewise"},
+    {"effective.svg", "Rays per second with the build counted"},
+    {"scenes.svg", "Performance by scene"}
+  };
+  char path[4][1024];
+  FILE *out = create(t->out, "RESULTS.md");
+  for (int i = 0; i < 4; i++) snprintf(path[i], sizeof path[i], "%s/%s", t->out, plots[i][0]);
+  plot_builders(t, path[0], sah, "SAH, % of SweepSAH", 0);
+  plot_builders(t, path[1], performance, "diffuse rays/s, % of SweepSAH", 1);
+  plot_effective(t, path[2]);
+  plot_scenes(t, path[3]);
+  fputs("# The paper's tables, made again\n\nMade by [tables.c](tables.c). Performance is diffuse rays per second with one thread; the same "
+        "collapse into leaves, layout and traversal for all trees. \"Paper\" columns: Karras and Aila 2013, on a GPU, 20 scenes of "
+        "theirs.\n", out);
+  print_report(out, t, 1);
+  fputs("\n## Diagrams\n", out);
+  for (int i = 0; i < 4; i++) fprintf(out, "\n![%s](%s)\n", plots[i][1], plots[i][0]);
+  if (t->notes) copy_notes(out, t->notes);
+  close_file(out, "RESULTS.md");
+}
+
+// >>main ----------------------------------------------------------------------------------------------------
+enum {
+  OPTION_SCENES, OPTION_BUILDERS, OPTION_THREADS, OPTION_REPS, OPTION_SIZE, OPTION_SAMPLES, OPTION_TRIANGLES, OPTION_CSV,
+  OPTION_OUT, OPTION_NOTES, OPTION_QUICK, OPTIONS
+};
+static const ex_option options_known[OPTIONS] = {
+  {"--scenes", EX_VALUE}, {"--builders", EX_VALUE}, {"--threads", EX_VALUE}, {"--reps", EX_VALUE}, {"--size", EX_VALUE},
+  {"--samples", EX_VALUE}, {"--triangles", EX_VALUE}, {"--csv", EX_VALUE}, {"--out", EX_VALUE}, {"--notes", EX_VALUE},
+  {"--quick", EX_NO_VALUE}
+};
+/* The builders of a list, and those that their tables are relative to. */
+static void choose_builders(tables *t, const char *list)
+{
+  memset(t->wanted, 0, sizeof t->wanted);
+  while (*list) {
+    size_t length = strcspn(list, ",");
+    int row = 0;
+    while (row < BUILDERS && (strlen(builders[row].key) != length || strncmp(builders[row].key, list, length))) row++;
+    if (row == BUILDERS) ex_die("no builder is named '%.*s'; --help lists them", (int)length, list);
+    t->wanted[row] = 1;
+    for (int table = FIRST_TABLE; table <= SECOND_TABLE; table++) {
+      if (builders[row].tables & table) t->wanted[base_of(table)] = 1;
+    }
+    list += length + (list[length] == ',');
+  }
+}
+static void set_option(void *user, int option, const char *value)
+{
+  tables *t = (tables *)user;
+  switch (option) {
+  case OPTION_BUILDERS: choose_builders(t, value); break;
+  case OPTION_THREADS: t->threads[1] = ex_parse_count(value, "--threads", 1024, NULL); break;
+  case OPTION_REPS: t->reps = (int)ex_parse_count(value, "--reps", REPS_MAX, NULL); break;
+  case OPTION_SIZE: ex_parse_size(value, "--size", &t->width, &t->height); break;
+  case OPTION_SAMPLES: t->samples = ex_parse_count(value, "--samples", 64, NULL); break;
+  case OPTION_TRIANGLES: t->triangles = ex_parse_count(value, "--triangles", 10000000, NULL); break;
+  case OPTION_CSV: t->csv_path = value; break;
+  case OPTION_OUT: t->out = value; break;
+  case OPTION_NOTES: t->notes = value; break;
+  case OPTION_QUICK: t->quick = 1; break;
+  default: ex_add_path(&t->inputs, value);
+  }
+}
+static void set_defaults(tables *t)
+{
+  if (!t->reps) t->reps = t->quick ? 1 : 5;
+  if (!t->width) t->width = t->quick ? 48 : 128;
+  if (!t->height) t->height = t->quick ? 36 : 96;
+  if (!t->samples) t->samples = t->quick ? 2 : 8;
+  if (!t->triangles) t->triangles = t->quick ? 6000 : 100000;
+  for (int kind = EX_TERRAIN; kind <= EX_SLIVERS && (kind || !t->inputs.count); kind++) ex_add_scene(&t->inputs, (ex_kind)kind);
+  t->turns = t->threads[1] > 1 ? 2 : 1;
+}
+int main(int argc, char **argv)
+{
+  tables t = {.threads = {1, ex_processors()}};
+  char help[2048];
+  size_t used = (size_t)snprintf(help, sizeof help, "%s", usage);
+  for (int i = 0; i < BUILDERS; i++) {
+    used += (size_t)snprintf(help + used, sizeof help - used, "%s%s", i % 8 ? ", " : ",\n  " + !i, builders[i].key);
+    t.wanted[i] = 1;
+  }
+  snprintf(help + used, sizeof help - used, "\n");
+  ex_arguments(argc, argv, help, options_known, OPTIONS, set_option, &t);
+  set_defaults(&t);
+  for (size_t i = 0; i < t.inputs.count; i++) t.progress.total += expected_ns(&t, ex_expected_triangles(&t.inputs.at[i], t.triangles));
+  t.scenes = (scene_results *)ex_allocate(t.inputs.count, sizeof *t.scenes);
+  for (size_t i = 0; i < t.inputs.count; i++) measure_scene(&t, &t.inputs.at[i], &t.scenes[i]);
+  measure_treelets(&t);
+  ex_clear_progress();
+  print_report(stdout, &t, !t.quick);
+  if (t.csv_path) write_csv(&t);
+  if (t.out) write_results(&t);
+  free(t.scenes);
+  free(t.inputs.at);
+  return 0;
+}
