@@ -1,7 +1,7 @@
 /* What the tests of the builders in examples/paper share. Include it after trbvh.h's implementation and test.h. */
 #ifndef TESTS_PAPER_H
 #define TESTS_PAPER_H
-#include "../examples/paper/paper.h"   /* before scenes.h, whose `scene` its variables would hide */
+#include "../examples/paper/judge.h"   /* before scenes.h, whose `scene` its variables would hide */
 #include "scenes.h"
 
 typedef struct paper_tree { trbvh bvh; trbvh_stats stats; } paper_tree;
