@@ -1,4 +1,5 @@
 /* The builders of examples/paper: valid trees of every scene, the same again, of the quality that theirs must have. */
+#define TRB_PACKED_REFS 5000u          /* both kinds of sort keys, at sizes that a test can afford */
 #define TRBVH_IMPLEMENTATION
 #include "../trbvh.h"
 #include "test.h"

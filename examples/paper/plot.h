@@ -54,7 +54,7 @@ static inline void paper_close_plot(paper_plot *p)
 static inline void paper_tick(const paper_plot *p, int vertical, double value)
 {
   char text[32];
-  if (value >= 1e6) snprintf(text, sizeof text, "1e%.0f", log10(value));
+  if (value >= 1e5) snprintf(text, sizeof text, "1e%.0f", log10(value));
   else snprintf(text, sizeof text, "%g", value);
   double x = paper_x(p, value), y = paper_y(p, value);
   if (vertical) {
