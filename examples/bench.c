@@ -2,7 +2,7 @@
  * Introduces: building again into the same tree, times and bytes by stage, many small trees on threads of your own.
  *
  *   cc -O2 examples/bench.c -o bench -lm -pthread && ./bench meshes/
- *   cc -O2 -DBENCH_EMBREE=3 examples/bench.c -o bench -lembree3 -lm -pthread     (or 4, and -lembree4)
+ *   cc -O2 -DEX_EMBREE=3 examples/bench.c -o bench -lembree3 -lm -pthread     (or 4, and -lembree4)
  *
  * Every repetition runs each builder once, so that noise hits all alike, and medians are printed. A build is timed as
  * an engine does it again for a mesh that has changed: into the same tree; "fresh" is into an empty one. Needs POSIX,
@@ -14,16 +14,10 @@
 #include "../trbvh.h"
 #define EX_PROGRAM "bench"
 #include "common.h"
+#include "embree.h"
 #include <dirent.h>
 #include <pthread.h>
 #include <unistd.h>
-#ifdef BENCH_EMBREE                    /* its major version */
-  #if BENCH_EMBREE >= 4
-    #include <embree4/rtcore.h>
-  #else
-    #include <embree3/rtcore.h>
-  #endif
-#endif
 
 static const char usage[] =
   "usage: bench [MESH or FOLDER]... [options]\n"
@@ -38,16 +32,16 @@ static const char usage[] =
 // >>rows ----------------------------------------------------------------------------------------------------
 /* trbvh's presets, BEST being the same as HIGH in this version; FAST once more, from boxes, which makes no triangles:
  * the work of Embree's builders, which are last. Those of one level are compared. */
-typedef struct builder { const char *name; int level, quality; uint32_t min_leaf, max_leaf; } builder;
+typedef struct builder { const char *name; int level, quality; } builder;
 static const builder builders[] = {
-  {"trbvh FAST", 0, TRBVH_QUALITY_FAST, 0, 0},
-  {"trbvh MEDIUM", 1, TRBVH_QUALITY_MEDIUM, 0, 0},
-  {"trbvh HIGH", 2, TRBVH_QUALITY_HIGH, 0, 0},
-  {"FAST, boxes", 0, TRBVH_QUALITY_FAST, 0, 0},
-#ifdef BENCH_EMBREE
-  {"Embree LOW", 0, RTC_BUILD_QUALITY_LOW, 4, 4},
-  {"Embree MEDIUM", 1, RTC_BUILD_QUALITY_MEDIUM, 1, 8},
-  {"Embree HIGH", 2, RTC_BUILD_QUALITY_HIGH, 1, 8},
+  {"trbvh FAST", 0, TRBVH_QUALITY_FAST},
+  {"trbvh MEDIUM", 1, TRBVH_QUALITY_MEDIUM},
+  {"trbvh HIGH", 2, TRBVH_QUALITY_HIGH},
+  {"FAST, boxes", 0, TRBVH_QUALITY_FAST},
+#ifdef EX_EMBREE
+  {"Embree LOW", 0, RTC_BUILD_QUALITY_LOW},
+  {"Embree MEDIUM", 1, RTC_BUILD_QUALITY_MEDIUM},
+  {"Embree HIGH", 2, RTC_BUILD_QUALITY_HIGH},
 #endif
 };
 enum { PRESETS = 3, FROM_BOXES = PRESETS, OURS, BUILDERS = sizeof builders / sizeof *builders, REPS_MAX = 99 };
@@ -255,28 +249,19 @@ typedef struct run {                   /* of one builder */
   double ms[SAH][REPS_MAX];            /* by column */
 } run;
 
-typedef struct box { float low[3], high[3]; } box;
-static const box no_box = {{FLT_MAX, FLT_MAX, FLT_MAX}, {-FLT_MAX, -FLT_MAX, -FLT_MAX}};
-static void extend(box *a, const float p[3])
-{
-  for (int i = 0; i < 3; i++) {
-    if (p[i] < a->low[i]) a->low[i] = p[i];
-    if (p[i] > a->high[i]) a->high[i] = p[i];
-  }
-}
 /* Those of the triangles; low > high, which is left out, for one that is not finite. */
-static box *boxes_of(const ex_mesh *mesh)
+static ex_box *boxes_of(const ex_mesh *mesh)
 {
-  box *boxes = (box *)ex_allocate(mesh->triangle_count, sizeof *boxes);
+  ex_box *boxes = (ex_box *)ex_allocate(mesh->triangle_count, sizeof *boxes);
   for (size_t i = 0; i < mesh->triangle_count; i++) {
     int finite = 1;
-    boxes[i] = no_box;
+    boxes[i] = ex_no_box();
     for (size_t k = 3 * i; k < 3 * i + 3; k++) {
       ex_vec p;
       finite &= ex_mesh_finite_corner(mesh, k, &p);
-      extend(&boxes[i], mesh->positions + 3 * (size_t)mesh->indices[k]);
+      ex_extend(&boxes[i], mesh->positions + 3 * (size_t)mesh->indices[k]);
     }
-    if (!finite) boxes[i] = no_box;
+    if (!finite) boxes[i] = ex_no_box();
   }
   return boxes;
 }
@@ -317,84 +302,12 @@ static void build_trbvh(run *r, const trbvh_geometry *geometry, int preset, uint
 }
 
 // >>Embree --------------------------------------------------------------------------------------------------
-#ifdef BENCH_EMBREE
-static const float cost_node = 1.2f, cost_prim = 1.0f;   /* trbvh's */
-
-/* As lean as nodes can be: 64 bytes. A child that is a leaf is its address plus 1. */
-typedef struct embree_node { ex_vec low[2], high[2]; void *children[2]; } embree_node;
-typedef struct embree_leaf { uint32_t count, prims[]; } embree_leaf;
+#ifdef EX_EMBREE
 typedef struct embree {
-  RTCDevice device;
-  RTCBVH bvhs[BUILDERS];
-  const ex_mesh *mesh;
-  struct RTCBuildPrimitive *boxes, *work;   /* of the triangles; a copy, which builds reorder, with room for splits */
-  void *memory;                        /* where these are */
-  size_t count, room;                  /* of boxes and work */
+  ex_embree builders;
   pthread_mutex_t lock;                /* for these, which Embree has allocated: */
   double bytes, most_bytes;
 } embree;
-
-static void *create_node(RTCThreadLocalAllocator allocator, unsigned count, void *user)
-{
-  (void)count, (void)user;
-  return rtcThreadLocalAlloc(allocator, sizeof(embree_node), 16);
-}
-static void set_children(void *node, void **children, unsigned count, void *user)
-{
-  (void)user;
-  memcpy(((embree_node *)node)->children, children, count * sizeof *children);
-}
-static void set_bounds(void *node, const struct RTCBounds **bounds, unsigned count, void *user)
-{
-  embree_node *n = (embree_node *)node;
-  (void)user;
-  for (unsigned i = 0; i < count; i++) {
-    n->low[i] = ex_load(&bounds[i]->lower_x);
-    n->high[i] = ex_load(&bounds[i]->upper_x);
-  }
-}
-static size_t leaf_size(size_t count) { return sizeof(embree_leaf) + count * sizeof(uint32_t); }
-static void *create_leaf(RTCThreadLocalAllocator allocator, const struct RTCBuildPrimitive *prims, size_t count,
-                         void *user)
-{
-  embree_leaf *leaf = (embree_leaf *)rtcThreadLocalAlloc(allocator, leaf_size(count), 4);
-  (void)user;
-  leaf->count = (uint32_t)count;
-  for (size_t i = 0; i < count; i++) leaf->prims[i] = prims[i].primID;
-  return (char *)leaf + 1;
-}
-
-/* The overlap of two boxes; Embree's are three floats, one of something else, three floats. */
-static void set_overlap(struct RTCBounds *out, const box *a, const struct RTCBuildPrimitive *prim)
-{
-  const float *low = &prim->lower_x, *high = &prim->upper_x;
-  float *out_low = &out->lower_x, *out_high = &out->upper_x;
-  for (int i = 0; i < 3; i++) {
-    out_low[i] = a->low[i] > low[i] ? a->low[i] : low[i];
-    out_high[i] = a->high[i] < high[i] ? a->high[i] : high[i];
-  }
-}
-/* As Embree splits triangles of its own: cuts the whole one exactly, and then keeps to the box that is left of it. */
-static void split_triangle(const struct RTCBuildPrimitive *prim, unsigned axis, float at, struct RTCBounds *left,
-                           struct RTCBounds *right, void *user)
-{
-  const ex_mesh *mesh = ((const embree *)user)->mesh;
-  const uint32_t *index = mesh->indices + 3 * (size_t)prim->primID;
-  box below = no_box, above = no_box;
-  for (int i = 0; i < 3; i++) {
-    const float *from = mesh->positions + 3 * (size_t)index[i], *to = mesh->positions + 3 * (size_t)index[(i + 1) % 3];
-    if (from[axis] <= at) extend(&below, from);
-    if (from[axis] >= at) extend(&above, from);
-    if ((from[axis] < at) == (to[axis] < at)) continue;
-    float cut[3], t = (at - from[axis]) / (to[axis] - from[axis]);
-    for (int k = 0; k < 3; k++) cut[k] = from[k] + t * (to[k] - from[k]);
-    cut[axis] = at;
-    extend(&below, cut);
-    extend(&above, cut);
-  }
-  set_overlap(left, &below, prim);
-  set_overlap(right, &above, prim);
-}
 
 static bool count_bytes(void *user, ssize_t bytes, bool post)
 {
@@ -406,94 +319,59 @@ static bool count_bytes(void *user, ssize_t bytes, bool post)
   pthread_mutex_unlock(&e->lock);
   return true;
 }
-static void make_boxes(embree *e, const box *boxes)
+static void start_embree(embree *e, const ex_mesh *mesh, const ex_box *boxes, uint32_t threads)
 {
-  size_t triangles = e->mesh->triangle_count;
-  e->memory = ex_allocate(triangles + triangles * 13 / 10 + 1, sizeof *e->boxes);
-  e->boxes = (struct RTCBuildPrimitive *)(((uintptr_t)e->memory + 31) & ~(uintptr_t)31);   /* as Embree loads them */
-  for (size_t i = 0; i < triangles; i++) {
-    memcpy(&e->boxes[e->count].lower_x, boxes[i].low, sizeof boxes[i].low);
-    memcpy(&e->boxes[e->count].upper_x, boxes[i].high, sizeof boxes[i].high);
-    e->boxes[e->count].primID = (unsigned)i;
-    e->count += boxes[i].low[0] <= boxes[i].high[0];
-  }
-  e->work = e->boxes + triangles;
-  e->room = e->count * 13 / 10;        /* as many splits as HIGH's */
-}
-static void start_embree(embree *e, const ex_mesh *mesh, const box *boxes, uint32_t threads)
-{
-  char config[32];
-  memset(e, 0, sizeof *e);
   pthread_mutex_init(&e->lock, NULL);
-  snprintf(config, sizeof config, "threads=%u", threads);
-  e->device = rtcNewDevice(config);
-  if (!e->device) ex_die("Embree: no device");
-  rtcSetDeviceMemoryMonitorFunction(e->device, count_bytes, e);
-  e->mesh = mesh;
-  make_boxes(e, boxes);
-  for (int i = OURS; i < BUILDERS; i++) e->bvhs[i] = rtcNewBVH(e->device);
+  e->bytes = e->most_bytes = 0;
+  ex_embree_start(&e->builders, mesh, threads);
+  rtcSetDeviceMemoryMonitorFunction(e->builders.device, count_bytes, e);
+  for (uint32_t i = 0; i < mesh->triangle_count; i++) {
+    if (boxes[i].low[0] <= boxes[i].high[0]) ex_embree_add(&e->builders, i, boxes[i].low, boxes[i].high);
+  }
 }
-static void end_embree(embree *e)      /* before the next device starts, which would get this one's threads */
+static void end_embree(embree *e)
 {
-  for (int i = OURS; i < BUILDERS; i++) rtcReleaseBVH(e->bvhs[i]);
-  rtcReleaseDevice(e->device);
+  ex_embree_stop(&e->builders);
   pthread_mutex_destroy(&e->lock);
-  free(e->memory);
 }
-/* It fails where it finds no tree within the depth that trbvh promises; all its numbers are unknown then. */
+/* Where Embree finds no tree, all numbers are unknown. */
 static void build_embree(embree *e, run *r, int number, int rep)
 {
-  const builder *of = builders + number;
-  struct RTCBuildArguments arguments = rtcDefaultBuildArguments();   /* two children, no blocks */
+  enum RTCBuildQuality quality = (enum RTCBuildQuality)builders[number].quality;
+  size_t room = ex_embree_room(&e->builders, quality);
   double bytes = e->most_bytes = e->bytes;
-  memcpy(e->work, e->boxes, e->count * sizeof *e->work);
-  arguments.buildQuality = (enum RTCBuildQuality)of->quality;
-  arguments.maxDepth = TRBVH_MAX_DEPTH;
-  arguments.minLeafSize = of->min_leaf;
-  arguments.maxLeafSize = of->max_leaf;
-  arguments.traversalCost = cost_node;
-  arguments.intersectionCost = cost_prim;
-  arguments.bvh = e->bvhs[number];
-  arguments.primitives = e->work;
-  arguments.primitiveCount = e->count;
-  arguments.primitiveArrayCapacity = of->quality == RTC_BUILD_QUALITY_HIGH ? e->room : e->count;
-  arguments.createNode = create_node;
-  arguments.setNodeChildren = set_children;
-  arguments.setNodeBounds = set_bounds;
-  arguments.createLeaf = create_leaf;
-  arguments.splitPrimitive = split_triangle;
-  arguments.userPtr = e;
-  double start = ex_now_ms();
-  r->root = rtcBuildBVH(&arguments);
-  r->ms[MS][rep] = r->root ? ex_now_ms() - start : -1;
+  r->root = ex_embree_build(&e->builders, quality, room);
+  r->ms[MS][rep] = e->builders.ms;
   if (e->most_bytes > bytes) {         /* in the first build; the array, too, is memory that it works in */
-    r->scratch = e->most_bytes - bytes + (double)(arguments.primitiveArrayCapacity * sizeof *e->work);
+    r->scratch = e->most_bytes - bytes + (double)(room * sizeof *e->builders.work);
   }
 }
-static double half_area(ex_vec low, ex_vec high)
+static double half_area(const ex_box *box)
 {
-  double x = (double)high.x - low.x, y = (double)high.y - low.y, z = (double)high.z - low.z;
+  const float *low = box->low, *high = box->high;
+  double x = (double)high[0] - low[0], y = (double)high[1] - low[1], z = (double)high[2] - low[2];
   return x * y + y * z + z * x;
 }
 /* Adds a subtree's part of the paper's equation 1, times the root's area, and its bytes. */
 static void add_subtree(const void *at, double area, double *cost, double *bytes)
 {
-  if ((uintptr_t)at & 1) {
-    const embree_leaf *leaf = (const embree_leaf *)(const void *)((const char *)at - 1);
-    *cost += cost_prim * area * leaf->count;
-    *bytes += (double)leaf_size(leaf->count);
+  const ex_embree_leaf *leaf = ex_embree_as_leaf(at);
+  if (leaf) {
+    *cost += ex_cost_prim * area * leaf->count;
+    *bytes += (double)ex_embree_leaf_size(leaf->count);
     return;
   }
-  const embree_node *node = (const embree_node *)at;
-  *cost += cost_node * area;
+  const ex_embree_node *node = (const ex_embree_node *)at;
+  *cost += ex_cost_node * area;
   *bytes += sizeof *node;
-  for (int i = 0; i < 2; i++) add_subtree(node->children[i], half_area(node->low[i], node->high[i]), cost, bytes);
+  for (int i = 0; i < 2; i++) add_subtree(node->children[i], half_area(&node->boxes[i]), cost, bytes);
 }
 static void judge_embree(const embree *e, run *r)
 {
   ex_vec low, high;
-  ex_mesh_bounds(e->mesh, &low, &high);
-  double area = half_area(low, high);
+  ex_mesh_bounds(e->builders.mesh, &low, &high);
+  ex_box all = {{low.x, low.y, low.z}, {high.x, high.y, high.z}};
+  double area = half_area(&all);
   if (r->root) add_subtree(r->root, area, &r->sah, &r->result);
   r->sah = !r->root ? -1 : area > 0 ? r->sah / area : 0;
   r->scratch = r->root ? r->scratch - r->result : -1;   /* the result is among what was allocated */
@@ -505,7 +383,7 @@ static void judge_embree(const embree *e, run *r)
 static void measure(bench *b, const input *in, const ex_mesh *mesh, int turn, size_t more, row rows[BUILDERS])
 {
   trbvh_geometry geometries[OURS];
-  box *boxes = boxes_of(mesh);
+  ex_box *boxes = boxes_of(mesh);
   run *runs = (run *)ex_allocate(BUILDERS, sizeof *runs);
   uint32_t threads = b->threads[turn];
   const char *slash = strrchr(in->name, '/'), *name = slash ? slash + 1 : in->name;
@@ -515,7 +393,7 @@ static void measure(bench *b, const input *in, const ex_mesh *mesh, int turn, si
     runs[i].options = options_of(i, threads, &runs[i].stats);
     keep_scratch(&runs[i].options, &geometries[i]);
   }
-#ifdef BENCH_EMBREE
+#ifdef EX_EMBREE
   embree e;
   start_embree(&e, mesh, boxes, threads);
 #endif
@@ -523,11 +401,11 @@ static void measure(bench *b, const input *in, const ex_mesh *mesh, int turn, si
     int rep = round ? round - 1 : 0;
     show_progress(b, name, in->size, (turn + round / (b->reps + 1.0)) / b->turns, more);
     for (int i = 0; i < OURS; i++) build_trbvh(&runs[i], &geometries[i], i, threads, rep);
-#ifdef BENCH_EMBREE
+#ifdef EX_EMBREE
     for (int i = OURS; i < BUILDERS; i++) build_embree(&e, &runs[i], i, rep);
 #endif
   }
-#ifdef BENCH_EMBREE
+#ifdef EX_EMBREE
   for (int i = OURS; i < BUILDERS; i++) judge_embree(&e, &runs[i]);
   end_embree(&e);
 #endif

@@ -1,6 +1,6 @@
 /* common.h - what the examples, the tests and the benchmark share. C99 and C++11; link with -lm.
  *
- *   vectors, time, random numbers, cameras
+ *   vectors, boxes, time, random numbers, cameras
  *   ex_mesh_read, ex_mesh_parse   OBJ, PLY and STL files, also damaged ones
  *   ex_mesh_demo                  the built-in scene
  *   ex_png_write                  pictures
@@ -65,6 +65,21 @@ static inline float ex_smooth(float from, float to, float x)   /* 0 before from,
 {
   x = ex_clamp((x - from) / (to - from), 0, 1);
   return x * x * (3 - 2 * x);
+}
+
+typedef struct ex_box { float low[3], high[3]; } ex_box;
+
+static inline ex_box ex_no_box(void)
+{
+  ex_box box = {{FLT_MAX, FLT_MAX, FLT_MAX}, {-FLT_MAX, -FLT_MAX, -FLT_MAX}};
+  return box;
+}
+static inline void ex_extend(ex_box *box, const float p[3])
+{
+  for (int i = 0; i < 3; i++) {
+    if (p[i] < box->low[i]) box->low[i] = p[i];
+    if (p[i] > box->high[i]) box->high[i] = p[i];
+  }
 }
 
 // >>time and chance -----------------------------------------------------------------------------------------
