@@ -13,11 +13,9 @@
 #define TRBVH_IMPLEMENTATION
 #include "../trbvh.h"
 #define EX_PROGRAM "bench"
-#include "common.h"
+#include "measure.h"
 #include "embree.h"
-#include <dirent.h>
 #include <pthread.h>
-#include <unistd.h>
 
 static const char usage[] =
   "usage: bench [MESH or FOLDER]... [options]\n"
@@ -65,17 +63,15 @@ typedef struct row {
   const builder *builder;
   double values[COLUMNS];              /* below 0: not known */
 } row;
-typedef struct input { const char *name; int scene; double size; } input;   /* a file, scene -1, and its bytes */
 typedef struct bench {
   const char *csv_path;
   FILE *csv;
   int reps, quick, adversarial, small;
   uint32_t threads[2];                 /* to measure with; the second is --threads */
   int turns;                           /* how many of these */
-  input *inputs;
-  size_t input_count;
+  ex_inputs inputs;
   row *rows;                           /* for each input, of these for each number of threads, of these the builders */
-  double start, shown, done, total;    /* progress: ms, and sizes of inputs */
+  ex_progress progress;                /* in sizes of inputs */
 } bench;
 
 static double ns_per_triangle(const row *r, int column)
@@ -102,141 +98,6 @@ static void write_csv(const bench *b, const row *r)
   }
   fputs("\n", b->csv);
   fflush(b->csv);
-}
-
-// >>progress ------------------------------------------------------------------------------------------------
-/* On a terminal a line that changes, else one for each input. part: of what is running, 0..1; more: inputs left */
-static void show_progress(bench *b, const char *what, double size, double part, size_t more)
-{
-  double now = ex_now_ms(), done = (b->done + size * part) / b->total;
-  int terminal = isatty(2);
-  char left[32] = "";
-  if (part > 0 && (!terminal || now - b->shown < 200)) return;
-  b->shown = now;
-  if (done > 0) {
-    double seconds = (now - b->start) * (1 - done) / done / 1e3;
-    int minutes = seconds > 100;
-    snprintf(left, sizeof left, ", about %.0f %s left", minutes ? seconds / 60 : seconds, minutes ? "min" : "s");
-  }
-  fprintf(stderr, terminal ? "\r%.40s, %u more%s      " : "%s, %u more%s\n", what, (unsigned)more, left);
-}
-static void clear_progress(void) { if (isatty(2)) fprintf(stderr, "\r%79s\r", ""); }
-
-// >>inputs --------------------------------------------------------------------------------------------------
-enum { TERRAIN, CITY, SOUP, SLIVERS, IDENTICAL, SORTED, REVERSED, TWO_CENTERS, OUTLIER, GEOMETRIC };
-static const input scenes[] = {{"terrain", TERRAIN, 1}, {"city", CITY, 1}, {"soup", SOUP, 1}, {"slivers", SLIVERS, 1}};
-static const input adversaries[] = {   /* the first is what the others are compared with */
-  {"small random triangles", SOUP, 1}, {"all identical", IDENTICAL, 1}, {"sorted along x", SORTED, 1},
-  {"reversed along x", REVERSED, 1}, {"flat with two centres", TWO_CENTERS, 1}, {"one of them 1e6 away", OUTLIER, 1},
-  {"long slivers", SLIVERS, 1}, {"scaled by 2^-(i mod 120)", GEOMETRIC, 1}
-};
-
-static ex_vec random_point(uint32_t *seed, float low, float high)
-{
-  float x = ex_random_in(seed, low, high), y = ex_random_in(seed, low, high), z = ex_random_in(seed, low, high);
-  return ex_v(x, y, z);
-}
-static ex_vec terrain_point(const void *nothing, float u, float v)
-{
-  (void)nothing;
-  return ex_v(100 * u, 8 * ex_fractal_noise(ex_v(7 * u, 0.5f, 7 * v)), 100 * v);
-}
-/* Towers along straight streets, with four balconies each. */
-static void add_city(ex_builder *b, uint32_t count)
-{
-  uint32_t seed = 2, side = (uint32_t)sqrt(count / 60.0);
-  for (uint32_t i = 0; i < side * side; i++) {
-    float x = (float)(i % side), z = (float)(i / side), half = 0.2f / (0.05f + ex_random(&seed));
-    ex_add_box(b, ex_v(x, half, z), ex_v(0.35f, 0, 0), ex_v(0, half, 0), ex_v(0, 0, 0.35f));
-    for (int k = 1; k < 5; k++) {
-      ex_vec middle = ex_v(x + 0.4f, 0.4f * half * (float)k, z);
-      ex_add_box(b, middle, ex_v(0.05f, 0, 0), ex_v(0, 0.02f, 0), ex_v(0, 0, 0.2f));
-    }
-  }
-}
-/* Triangle i of n that share no corner. */
-static void make_triangle(int kind, uint32_t i, uint32_t n, uint32_t *seed, ex_vec p[3])
-{
-  ex_vec center = random_point(seed, 0, 1);
-  float size = 0.5f / cbrtf((float)n), scale = kind == GEOMETRIC ? ldexpf(1, -(int)(i % 120)) : 1;
-  if (kind == SORTED) center.x = (float)i / (float)n;
-  if (kind == REVERSED) center.x = (float)(n - i) / (float)n;
-  if (kind == OUTLIER && i == n - 1) center = ex_v(1e6f, 1e6f, 1e6f);
-  for (int k = 0; k < 3; k++) p[k] = ex_scale(ex_add(center, random_point(seed, -size, size)), scale);
-  if (kind == SLIVERS) {
-    p[1] = ex_add(p[0], random_point(seed, -0.4f, 0.4f));
-    p[2] = ex_add(p[1], random_point(seed, -0.001f, 0.001f));
-  }
-  if (kind == IDENTICAL || kind == TWO_CENTERS) {   /* of the boxes; they are exact, as these sums are */
-    float x = kind == IDENTICAL ? 0 : (float)(i & 1), s = kind == IDENTICAL ? 1 : ex_random(seed) / 4;
-    p[0] = ex_v(x - s, 0, -s);
-    p[1] = ex_v(x + s, 0, -s);
-    p[2] = ex_v(x, 0, s);
-  }
-}
-static void make_scene(ex_builder *b, int kind, uint32_t count)
-{
-  unsigned side = (unsigned)sqrt(count / 2.0);
-  uint32_t seed = 1;
-  ex_vec p[3];
-  if (kind == TERRAIN) ex_add_surface(b, terrain_point, NULL, side, side, 0);
-  if (kind == CITY) add_city(b, count);
-  for (uint32_t i = 0; i < count && kind >= SOUP; i++) {
-    make_triangle(kind, i, count, &seed, p);
-    for (int k = 0; k < 3; k++) ex_add_vertex(b, p[k]);
-    ex_add_triangle(b, 3 * i, 3 * i + 1, 3 * i + 2);
-  }
-}
-
-static void add_input(bench *b, input one)
-{
-  if ((b->input_count & (b->input_count - 1)) == 0) {   /* there is room for the next power of two */
-    b->inputs = (input *)realloc(b->inputs, (2 * b->input_count + 1) * sizeof *b->inputs);
-    if (!b->inputs) ex_die("not enough memory");
-  }
-  b->inputs[b->input_count++] = one;
-}
-static void add_file(bench *b, const char *path)
-{
-  input one = {path, -1, 0};
-  FILE *file = fopen(path, "rb");
-  if (!file) ex_die("%s: cannot be opened", path);
-  if (fseek(file, 0, SEEK_END) == 0) one.size = (double)ftell(file);
-  fclose(file);
-  add_input(b, one);
-}
-static int by_name(const void *a, const void *b) { return strcmp(((const input *)a)->name, ((const input *)b)->name); }
-static void add_path(bench *b, const char *path)
-{
-  size_t first = b->input_count;
-  DIR *folder = opendir(path);
-  if (!folder) {
-    add_file(b, path);
-    return;
-  }
-  for (struct dirent *entry; (entry = readdir(folder)) != NULL;) {
-    const char *dot = strrchr(entry->d_name, '.');
-    if (!dot || strlen(dot) != 4 || !strstr(".obj.ply.stl.OBJ.PLY.STL", dot)) continue;
-    size_t size = strlen(path) + strlen(entry->d_name) + 2;
-    char *name = (char *)ex_allocate(size, 1);   /* until the end */
-    snprintf(name, size, "%s/%s", path, entry->d_name);
-    add_file(b, name);
-  }
-  closedir(folder);
-  if (b->input_count == first) ex_die("%s: no OBJ, PLY or STL file in it", path);
-  qsort(b->inputs + first, b->input_count - first, sizeof *b->inputs, by_name);
-}
-static ex_mesh load(const bench *b, const input *in)
-{
-  ex_builder built;
-  ex_vec low, high;
-  char error[512];
-  memset(&built, 0, sizeof built);
-  if (in->scene >= 0) make_scene(&built, in->scene, b->quick ? 20000 : 200000);
-  else if (!ex_mesh_read(in->name, &built.mesh, error, sizeof error)) ex_die("%s", error);
-  if (built.failed) ex_die("not enough memory");
-  if (!ex_mesh_bounds(&built.mesh, &low, &high)) ex_die("%s: no vertex is finite", in->name);
-  return built.mesh;
 }
 
 // >>trbvh ---------------------------------------------------------------------------------------------------
@@ -380,13 +241,13 @@ static void judge_embree(const embree *e, run *r)
 
 // >>measuring -----------------------------------------------------------------------------------------------
 /* All builders with one mesh and one number of threads. */
-static void measure(bench *b, const input *in, const ex_mesh *mesh, int turn, size_t more, row rows[BUILDERS])
+static void measure(bench *b, const ex_input *in, const ex_mesh *mesh, int turn, row rows[BUILDERS])
 {
   trbvh_geometry geometries[OURS];
   ex_box *boxes = boxes_of(mesh);
   run *runs = (run *)ex_allocate(BUILDERS, sizeof *runs);
   uint32_t threads = b->threads[turn];
-  const char *slash = strrchr(in->name, '/'), *name = slash ? slash + 1 : in->name;
+  const char *name = ex_short_name(in);
   for (int i = 0; i < OURS; i++) {
     geometries[i] = ex_mesh_geometry(mesh);
     if (i == FROM_BOXES) geometries[i] = (trbvh_geometry){.boxes = boxes->low, .count = mesh->triangle_count};
@@ -399,7 +260,7 @@ static void measure(bench *b, const input *in, const ex_mesh *mesh, int turn, si
 #endif
   for (int round = 0; round <= b->reps; round++) {   /* the first, which allocates, does not count */
     int rep = round ? round - 1 : 0;
-    show_progress(b, name, in->size, (turn + round / (b->reps + 1.0)) / b->turns, more);
+    ex_show_progress(&b->progress, name, in->size * (turn + round / (b->reps + 1.0)) / b->turns);
     for (int i = 0; i < OURS; i++) build_trbvh(&runs[i], &geometries[i], i, threads, rep);
 #ifdef EX_EMBREE
     for (int i = OURS; i < BUILDERS; i++) build_embree(&e, &runs[i], i, rep);
@@ -468,12 +329,12 @@ static const row *row_of(const bench *b, size_t i, int turn, int number)
 static double geometric_mean(const bench *b, int turn, int number, int column)
 {
   double sum = 0;
-  for (size_t i = 0; i < b->input_count; i++) {
+  for (size_t i = 0; i < b->inputs.count; i++) {
     double value = row_of(b, i, turn, number)->values[column];
     if (!(value > 0)) return -1;
     sum += log(value);
   }
-  return exp(sum / (double)b->input_count);
+  return exp(sum / (double)b->inputs.count);
 }
 static void print_means(const bench *b)
 {
@@ -497,8 +358,8 @@ static void print_means(const bench *b)
 static double mean_ns(const bench *b, int turn, int number, int column)
 {
   double sum = 0;
-  for (size_t i = 0; i < b->input_count; i++) sum += ns_per_triangle(row_of(b, i, turn, number), column);
-  return sum / (double)b->input_count;
+  for (size_t i = 0; i < b->inputs.count; i++) sum += ns_per_triangle(row_of(b, i, turn, number), column);
+  return sum / (double)b->inputs.count;
 }
 /* Amdahl's law: of the time t1 of one thread a share s stays serial, and n threads take t(n) = t1 (s + (1 - s) / n).
  * The share is the one with which t(measured) = tm: more than 1 where more threads take longer. */
@@ -536,8 +397,8 @@ static void print_adversaries(const bench *b)
     printf("\nns/triangle, and times the first line's; triangles: %.0f; threads: %u\n%-26s", b->rows->triangles,
            b->threads[turn], "");
     for (int i = 0; i < BUILDERS; i++) printf("%20s", builders[i].name);
-    for (size_t m = 0; m < b->input_count; m++) {
-      printf("\n  %-24s", b->inputs[m].name);
+    for (size_t m = 0; m < b->inputs.count; m++) {
+      printf("\n  %-24s", b->inputs.at[m].name);
       for (int i = 0; i < BUILDERS; i++) {
         double ns = ns_per_triangle(row_of(b, m, turn, i), MS);
         if (ns < 0) printf("%20s", "failed");
@@ -547,23 +408,32 @@ static void print_adversaries(const bench *b)
     puts("");
   }
 }
+static void add_built_in(bench *b)
+{
+  static const ex_kind scenes[] = {EX_TERRAIN, EX_CITY, EX_SOUP, EX_SLIVERS};
+  static const ex_kind adversaries[] = {   /* the first is what the others are compared with */
+    EX_SOUP, EX_IDENTICAL, EX_SORTED, EX_REVERSED, EX_TWO_CENTERS, EX_OUTLIER, EX_SLIVERS, EX_GEOMETRIC
+  };
+  if (b->adversarial) {
+    for (size_t i = 0; i < sizeof adversaries / sizeof *adversaries; i++) ex_add_scene(&b->inputs, adversaries[i]);
+  } else {
+    for (size_t i = 0; i < sizeof scenes / sizeof *scenes; i++) ex_add_scene(&b->inputs, scenes[i]);
+  }
+}
 static void bench_meshes(bench *b)
 {
-  const input *built_in = b->adversarial ? adversaries : scenes;
-  size_t built_in_count = b->adversarial ? sizeof adversaries / sizeof *adversaries : sizeof scenes / sizeof *scenes;
-  if (b->input_count) built_in_count = 0;
-  for (size_t i = 0; i < built_in_count; i++) add_input(b, built_in[i]);
-  for (size_t i = 0; i < b->input_count; i++) b->total += b->inputs[i].size;
-  b->rows = (row *)ex_allocate(b->input_count * (size_t)b->turns * BUILDERS, sizeof *b->rows);
+  if (!b->inputs.count) add_built_in(b);
+  for (size_t i = 0; i < b->inputs.count; i++) b->progress.total += b->inputs.at[i].size;
+  b->rows = (row *)ex_allocate(b->inputs.count * (size_t)b->turns * BUILDERS, sizeof *b->rows);
   row *rows = b->rows;
-  for (size_t i = 0; i < b->input_count; i++) {
-    ex_mesh mesh = load(b, &b->inputs[i]);
+  for (size_t i = 0; i < b->inputs.count; i++) {
+    ex_mesh mesh = ex_load_input(&b->inputs.at[i], b->quick ? 20000 : 200000);
     for (int turn = 0; turn < b->turns; turn++, rows += BUILDERS) {
-      measure(b, &b->inputs[i], &mesh, turn, b->input_count - 1 - i, rows);
-      clear_progress();
+      measure(b, &b->inputs.at[i], &mesh, turn, rows);
+      ex_clear_progress();
       if (!b->adversarial) print_rows(rows);
     }
-    b->done += b->inputs[i].size;
+    b->progress.done += b->inputs.at[i].size;
     ex_mesh_free(&mesh);
   }
   if (b->adversarial) print_adversaries(b);
@@ -597,7 +467,7 @@ static void bench_small(bench *b)
   memset(rocks, 0, sizeof rocks);
   for (int n = 0; n < SIZES; n++) ex_add_surface(&rocks[n], ex_rock_point, &center, sides[n][0], sides[n][1], 1);
   for (int rep = 0; rep < b->reps; rep++) {
-    show_progress(b, "small meshes", 1, (double)rep / b->reps, 1);
+    ex_show_progress(&b->progress, "small meshes", (double)rep / b->reps);
     for (int i = 0; i < SIZES * PRESETS; i++) {
       trbvh_options options = options_of(i % PRESETS, 1, NULL);
       trbvh_geometry geometry = ex_mesh_geometry(&rocks[i / PRESETS].mesh);
@@ -606,7 +476,7 @@ static void bench_small(bench *b)
       free(options.scratch);
     }
   }
-  clear_progress();
+  ex_clear_progress();
   trbvh_free(&tree);
   printf("\nsmall meshes, one thread; fixed: us/build - triangles * ns/tri of the last line\n  triangles");
   for (int i = 0; i < PRESETS; i++) printf("  | %-12s us/build  ns/tri   fixed", builders[i].name);
@@ -622,7 +492,7 @@ static void bench_small(bench *b)
   }
   puts("");
   for (int n = 0; n < SIZES; n++) ex_mesh_free(&rocks[n].mesh);
-  b->done = 1;
+  b->progress.done = 1;
 }
 
 /* Many meshes in the same arrays: mesh i is the triangles from first[i] to first[i + 1]. */
@@ -669,19 +539,19 @@ static void bench_batch(bench *b)
   memset(&built, 0, sizeof built);
   for (uint32_t i = 0; i < count; i++) {
     unsigned across = 5 + ex_random_bits(&seed) % 6, down = 5 + ex_random_bits(&seed) % 6;
-    ex_vec center = random_point(&seed, -100, 100);
+    ex_vec center = ex_random_point(&seed, -100, 100);
     ex_add_surface(&built, ex_rock_point, &center, across, down, 1);
     first[i + 1] = built.mesh.triangle_count;
   }
   if (built.failed) ex_die("not enough memory");
   for (int rep = 0; rep < b->reps; rep++) {
-    show_progress(b, "a batch of small meshes", 1, (double)rep / b->reps, 0);
+    ex_show_progress(&b->progress, "a batch of small meshes", (double)rep / b->reps);
     for (int i = 0; i < b->turns * PRESETS; i++) {
       batch of = {&built.mesh, first, count, b->threads[i / PRESETS], i % PRESETS};
       ms[i / PRESETS][i % PRESETS][rep] = batch_ms(&of);
     }
   }
-  clear_progress();
+  ex_clear_progress();
   printf("\n%u meshes of 50 to 200 triangles, together %u; each is built by one thread, into a tree of the thread's\n"
          "    threads", count, built.mesh.triangle_count);
   for (int i = 0; i < PRESETS; i++) printf("  | %-12s       ms  Mtri/s  speed-up", builders[i].name);
@@ -715,14 +585,14 @@ static void set_option(void *user, int option, const char *value)
   case OPTION_QUICK: b->quick = 1; break;
   case OPTION_ADVERSARIAL: b->adversarial = 1; break;
   case OPTION_SMALL: b->small = 1; break;
-  default: add_path(b, value);
+  default: ex_add_path(&b->inputs, value);
   }
 }
 int main(int argc, char **argv)
 {
   bench b = {.threads = {1, ex_processors()}};
   ex_arguments(argc, argv, usage, options_known, OPTIONS, set_option, &b);
-  if (b.adversarial + b.small + (b.input_count > 0) > 1) ex_die("meshes, --adversarial or --small, one at a time");
+  if (b.adversarial + b.small + (b.inputs.count > 0) > 1) ex_die("meshes, --adversarial or --small, one at a time");
   if (!b.reps) b.reps = b.quick ? 3 : 9;
   b.turns = b.threads[1] > 1 ? 2 : 1;
   if (b.csv_path) {
@@ -730,13 +600,12 @@ int main(int argc, char **argv)
     if (!b.csv) ex_die("%s: cannot be written", b.csv_path);
     fputs(csv_header, b.csv);
   }
-  b.start = ex_now_ms();
   if (b.small) {
-    b.total = 2;
+    b.progress.total = 2;
     bench_small(&b);
     bench_batch(&b);
   } else bench_meshes(&b);
   if (b.csv && fclose(b.csv)) ex_die("%s: cannot be written", b.csv_path);
-  free(b.inputs);
+  free(b.inputs.at);
   return 0;
 }

@@ -17,6 +17,7 @@
 #include "../measure.h"
 #include "bittner.h"
 #include "early.h"
+#include "embree.h"
 #include "grid.h"
 #include "hlbvh.h"
 #include "hploc.h"
@@ -27,9 +28,6 @@
 #include "plot.h"
 #include "sbvh.h"
 #include "sweep.h"
-#ifdef EX_EMBREE
-  #include "embree.h"
-#endif
 
 static const char usage[] =
   "usage: tables [MESH or FOLDER]... [options]\n"
@@ -65,9 +63,10 @@ typedef struct builder {
 
 static const paper_bittner_settings from_sweep = {.start = paper_sweep};
 #ifdef EX_EMBREE
-static const paper_embree_settings embree_low = {RTC_BUILD_QUALITY_LOW, 4, 4};
-static const paper_embree_settings embree_medium = {RTC_BUILD_QUALITY_MEDIUM, 1, 8};
-static const paper_embree_settings embree_high = {RTC_BUILD_QUALITY_HIGH, 1, 8};
+static ex_embree peer;                 /* started for the mesh at hand */
+static const paper_embree_parameters embree_low = {&peer, RTC_BUILD_QUALITY_LOW};
+static const paper_embree_parameters embree_medium = {&peer, RTC_BUILD_QUALITY_MEDIUM};
+static const paper_embree_parameters embree_high = {&peer, RTC_BUILD_QUALITY_HIGH};
 #endif
 /* The rows of the tables, in their order. The paper's figures: its tables 1 and 2. */
 static const builder builders[] = {
@@ -135,12 +134,13 @@ typedef struct tables {
   double naive_us, dp_us;              /* a treelet; 0: not measured */
 } tables;
 
-static int base_of(int table)          /* the row that a table is relative to */
+static int row_of(const char *key)     /* BUILDERS where there is none */
 {
-  for (int i = 0;; i++) {
-    if (!strcmp(builders[i].key, table == FIRST_TABLE ? "sweep" : "sbvh")) return i;
-  }
+  int row = 0;
+  while (row < BUILDERS && strcmp(builders[row].key, key)) row++;
+  return row;
 }
+static int base_of(int table) { return row_of(table == FIRST_TABLE ? "sweep" : "sbvh"); }   /* what it is relative to */
 static double rays_ns(const tables *t)   /* expected for all rays of one tree */
 {
   double rays = (double)t->width * t->height * PAPER_CAMERAS * (1 + 2.0 * t->samples);
@@ -190,7 +190,7 @@ static double build_other(const tables *t, const builder *of, trbvh *tree, const
     ex_check(paper_make(tree, geometry, options, of->make, of->parameters, &r->references), of->name, options->stats);
     all += ms[count++] = ex_now_ms() - start;
 #ifdef EX_EMBREE
-    if (of->make == paper_embree) ms[count - 1] = paper_embree_ms;   /* without our conversion; below 0 where it failed */
+    if (of->make == paper_embree) ms[count - 1] = peer.ms;   /* without what we make of its tree; below 0 where it has none */
 #endif
   } while (count < t->reps && all < 300);
   return ex_median(ms, count);
@@ -292,21 +292,24 @@ static void measure_peers(const tables *t, const ex_mesh *mesh, const ex_ray_set
 {
   static const enum RTCBuildQuality qualities[PEERS] = {RTC_BUILD_QUALITY_LOW, RTC_BUILD_QUALITY_MEDIUM, RTC_BUILD_QUALITY_HIGH};
   for (int i = 0; i < PEERS * t->turns; i++) {
-    int turn = i / PEERS, peer = i % PEERS;
+    int turn = i / PEERS;
     uint32_t threads = t->threads[turn];
-    ex_embree_scene scene = ex_embree_scene_make(mesh, qualities[peer], threads);
-    s->peers[peer].made = 1;
-    s->peers[peer].ms[turn] = scene.build_ms;
+    result *r = &s->peers[i % PEERS];
+    ex_embree_start(&peer, mesh, threads);
+    RTCScene embree = ex_embree_scene(&peer, qualities[i % PEERS], &r->ms[turn]);
+    r->made = 1;
     for (int kind = 0; kind < EX_KINDS; kind++) {
+      const ex_ray_set *set = &sets[kind];
       double ms[REPS_MAX];
-      for (int rep = -1; rep < t->reps; rep++) {
-        double once = ex_embree_trace(&scene, sets[kind].rays, sets[kind].count, threads, kind == EX_AMBIENT, a->again,
-                                      a->occluded_again);
+      for (int rep = -1; rep < t->reps && set->count; rep++) {
+        trbvh_hit *hits = kind == EX_AMBIENT ? NULL : a->again;
+        double once = ex_embree_trace(embree, set->rays, set->count, hits, a->occluded_again, threads);
         if (rep >= 0) ms[rep] = once;
       }
-      if (sets[kind].count) s->peers[peer].rates[turn][kind] = (double)sets[kind].count / ex_median(ms, t->reps) / 1e3;
+      if (set->count) r->rates[turn][kind] = (double)set->count / ex_median(ms, t->reps) / 1e3;
     }
-    ex_embree_scene_free(&scene);
+    rtcReleaseScene(embree);
+    ex_embree_stop(&peer);
   }
 }
 #endif
@@ -324,6 +327,9 @@ static void measure_scene(tables *t, const ex_input *in, scene_results *s)
   s->triangles = mesh.triangle_count;
   double done = t->progress.done;
   ex_show_progress(&t->progress, s->name, 0);
+#ifdef EX_EMBREE
+  ex_embree_start(&peer, &mesh, 1);
+#endif
   for (int i = -1, sbvh = base_of(SECOND_TABLE); i < BUILDERS; i++) {   /* SBVH first: others match its references */
     int row = i < 0 ? sbvh : i;
     if (i == sbvh || !t->wanted[row]) continue;
@@ -331,6 +337,9 @@ static void measure_scene(tables *t, const ex_input *in, scene_results *s)
     t->progress.done += s->triangles * builders[row].expected;
     ex_show_progress(&t->progress, s->name, 1);
   }
+#ifdef EX_EMBREE
+  ex_embree_stop(&peer);
+#endif
   ex_check(trbvh_build(&first, &geometry, NULL), "building", NULL);
   paper_make_rays(&scene, &first, t->width, t->height, t->samples, sets);
   paper_points points = paper_make_points(&mesh, t->quick ? 4096 : 32768);
@@ -599,11 +608,8 @@ static void print_break_even(FILE *out, const tables *t)
   double *at = (double *)ex_allocate(t->inputs.count, sizeof *at);
   fputs("\n### From how many rays on a slower build pays, one thread\n\n| | median of the scenes | first | last |\n|---|--:|--:|--:|\n", out);
   for (size_t k = 0; k < sizeof pairs / sizeof *pairs; k++) {
-    int rows[2] = {0, 0};
+    int rows[2] = {row_of(pairs[k][0]), row_of(pairs[k][1])};
     size_t count = 0;
-    for (int side = 0; side < 2; side++) {
-      while (strcmp(builders[rows[side]].key, pairs[k][side])) rows[side]++;
-    }
     for (size_t i = 0; i < t->inputs.count; i++) {
       const result *a = &t->scenes[i].rows[rows[0]], *b = &t->scenes[i].rows[rows[1]];
       if (a->rates[0][EX_DIFFUSE] > 0 && b->rates[0][EX_DIFFUSE] > 0) at[count++] = break_even(a, b);
@@ -639,14 +645,17 @@ static void print_peers(FILE *out, const tables *t)
           "| %-*s | build, ns/triangle | primary | ambient occlusion | diffuse | all threads: build | primary | ambient occlusion "
           "| diffuse |", NAME, "");
   print_rule(out, NAME, 8, 6);
+  const int own[] = {row_of("lbvh"), row_of("trbvh")};
   for (int i = -2; i < PEERS; i++) {
-    fprintf(out, "| %-*s |", NAME, i < 0 ? builders[i + 3].name : peer_names[i]);
+    int row = own[i < 0 ? i + 2 : 0];
+    if (i < 0 && !t->wanted[row]) continue;
+    fprintf(out, "| %-*s |", NAME, i < 0 ? builders[row].name : peer_names[i]);
     for (int k = 0; k < TURNS * (1 + EX_KINDS); k++) {
       int turn = k / (1 + EX_KINDS), kind = k % (1 + EX_KINDS) - 1;
       double sum = 0;
       for (size_t m = 0; m < t->inputs.count; m++) {
         const scene_results *s = &t->scenes[m];
-        const result *r = i < 0 ? &s->rows[i + 3] : &s->peers[i];
+        const result *r = i < 0 ? &s->rows[row] : &s->peers[i];
         sum += log(kind < 0 ? r->ms[turn] * 1e6 / s->triangles : r->rates[turn][kind]);
       }
       print_cell(out, 6, kind < 0 ? 0 : 2, exp(sum / (double)t->inputs.count));
@@ -746,8 +755,7 @@ static int shown_rows(const tables *t, int rows[BUILDERS])
   static const char *const keys[] = {"lbvh", "ploc", "trbvh", "bittner", "sweep", "trbvh-30", "sbvh"};
   int count = 0;
   for (size_t k = 0; k < sizeof keys / sizeof *keys; k++) {
-    int row = 0;
-    while (strcmp(builders[row].key, keys[k])) row++;
+    int row = row_of(keys[k]);
     if (t->wanted[row]) rows[count++] = row;
   }
   return count;
@@ -857,9 +865,10 @@ static void choose_builders(tables *t, const char *list)
   memset(t->wanted, 0, sizeof t->wanted);
   while (*list) {
     size_t length = strcspn(list, ",");
-    int row = 0;
-    while (row < BUILDERS && (strlen(builders[row].key) != length || strncmp(builders[row].key, list, length))) row++;
-    if (row == BUILDERS) ex_die("no builder is named '%.*s'; --help lists them", (int)length, list);
+    char key[32];
+    snprintf(key, sizeof key, "%.*s", (int)length, list);
+    int row = row_of(key);
+    if (row == BUILDERS) ex_die("no builder is named '%s'; --help lists them", key);
     t->wanted[row] = 1;
     for (int table = FIRST_TABLE; table <= SECOND_TABLE; table++) {
       if (builders[row].tables & table) t->wanted[base_of(table)] = 1;
