@@ -679,15 +679,18 @@ typedef struct trb_plane { int axis, level; float position; } trb_plane;
 
 TRB_CORE trb_plane trb_median_plane(trbvh_node box, trb_grid grid) {
   trb_plane plane;
+  float longest = 0;
   int k;
   plane.axis = 0; plane.level = -TRB_GRID_BITS - 1; plane.position = 0;
   for (k = 0; k < 3; k++) {
     trbvh_u32 low = trb_cell(box.min[k], grid.origin[k], grid.cells_per_unit);
     trbvh_u32 high = trb_cell(box.max[k], grid.origin[k], grid.cells_per_unit);
     if (low != high) {
-      int bit = (int)trb_log2(low ^ high);
-      if (bit - TRB_GRID_BITS > plane.level) {       /* of equally important planes the first, as in the Morton code */
-        plane.level = bit - TRB_GRID_BITS;
+      const int bit = (int)trb_log2(low ^ high), level = bit - TRB_GRID_BITS;
+      const float side = box.max[k] - box.min[k];
+      if (level > plane.level || (level == plane.level && side > longest)) {   /* of equal ones that across the longest side */
+        plane.level = level;
+        longest = side;
         plane.axis = k;
         plane.position = grid.origin[k] + (float)(high >> bit << bit) * grid.units_per_cell;
       }

@@ -1262,6 +1262,42 @@ static void test_fragments(void) {
 }
 
 /* The scale spends the budget, no more, and nearly all of it. */
+/* The most important plane that crosses a box, found by halving the scene; of equal ones that across the longest side. */
+static void test_median_plane(void) {
+  rng r = {11};
+  trbvh_node scene = {{0, 0, 0}, 0, {1024, 1024, 1024}, 0};
+  const trb_grid grid = trb_make_grid(scene);
+  uint32_t i, ties = 0;
+  for (i = 0; i < 20000; i++) {
+    trbvh_node box;
+    trb_plane plane;
+    int level, k, found = 0, axis = 0;
+    float longest = 0;
+    double position = 0;
+    for (k = 0; k < 3; k++) {
+      const float size = i % 3 == 0 ? (float)(1u << rng_below(&r, 9)) : 300 * rng_unit(&r);
+      box.min[k] = i % 3 == 1 ? 0.37f + (float)rng_below(&r, 700) : 700 * rng_unit(&r);
+      box.max[k] = box.min[k] + size;
+    }
+    for (level = 1; level <= 12 && !found; level++) {
+      const double side = 1024.0 / (double)(1u << level);    /* between planes of this level, and those above */
+      for (k = 0; k < 3; k++) {
+        const double at = side * floor((double)box.max[k] / side);
+        const float length = box.max[k] - box.min[k];
+        if (at <= box.min[k]) continue;
+        ties += found > 0;
+        if (!found || length > longest) { axis = k; position = at; longest = length; }
+        found = level;
+      }
+    }
+    plane = trb_median_plane(box, grid);
+    if (!found) continue;
+    CHECK_MSG(plane.level == -found && plane.axis == axis && fabs(plane.position - position) < 1e-2,
+              "level %d, axis %d at %g, not %d, %d at %g", plane.level, plane.axis, (double)plane.position, -found, axis, position);
+  }
+  CHECK(ties > 1000);
+}
+
 static void test_split_budget(void) {
   static const float budgets[] = {0.1f, 0.3f, 1, 4};
   enum { COUNT = 5000 };
@@ -1314,6 +1350,7 @@ int main(int argc, char **argv) {
   RUN(test_final_trees);
   RUN(test_depth_bound);
   RUN(test_fragments);
+  RUN(test_median_plane);
   RUN(test_split_budget);
   return test_finish();
 }
