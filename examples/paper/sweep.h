@@ -16,15 +16,18 @@ typedef struct paper_sweeper {
 } paper_sweeper;
 typedef struct paper_cut { double cost, balance; int axis; uint32_t left; } paper_cut;   /* left: references there */
 
+/* Sorts as the centre of a reference's box does, and of equal ones as their numbers do. */
+static inline uint64_t paper_center_key(const paper_build *p, uint32_t ref, int axis)
+{
+  const trbvh_node *box = &p->refs[ref];
+  return (uint64_t)paper_sortable(0.5f * box->min[axis] + 0.5f * box->max[axis]) << 32 | ref;
+}
 static inline void paper_sort_centers(paper_sweeper *s)
 {
   uint32_t count = s->p->ref_count;
   uint64_t *keys = (uint64_t *)ex_allocate(count, sizeof *keys);
   for (int axis = 0; axis < 3; axis++) {
-    for (uint32_t i = 0; i < count; i++) {
-      const trbvh_node *ref = &s->p->refs[i];
-      keys[i] = (uint64_t)paper_sortable(0.5f * ref->min[axis] + 0.5f * ref->max[axis]) << 32 | i;
-    }
+    for (uint32_t i = 0; i < count; i++) keys[i] = paper_center_key(s->p, i, axis);
     paper_sort(keys, count, 32);
     for (uint32_t i = 0; i < count; i++) s->order[axis][i] = (uint32_t)keys[i];
   }
