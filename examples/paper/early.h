@@ -83,8 +83,8 @@ static inline uint32_t paper_find_threshold(paper_pieces *s)
 {
   uint32_t low = 0, high = 0;
   for (uint32_t i = 0; i < s->count; i++) high = TRB_MAX(s->sizes[i], high);
-  while (low < high) {
-    uint32_t middle = low + (high - low) / 2;
+  while (low < high) {                 /* down by a factor of four at most, where nearly all pieces will be used */
+    uint32_t half = (high - low + 1) / 2, middle = high - TRB_MIN(half, 1u << 21);
     if (paper_cut_pieces(s, middle, 0) > s->most) {
       low = middle + 1;
     } else {
@@ -163,11 +163,16 @@ static inline void paper_esc(paper_build *p)
 }
 
 // ---- EVH ----
-static inline double paper_edge_volume(const float a[3], const float b[3])   /* and of b, a the same */
+/* Of a, b and of b, a the same; 0 for edges so short that padding is lost among denormal numbers. */
+static inline double paper_edge_volume(const float a[3], const float b[3])
 {
-  double volume = 1;
-  for (int k = 0; k < 3; k++) volume *= a[k] < b[k] ? (double)b[k] - a[k] : (double)a[k] - b[k];
-  return volume;
+  double volume = 1, longest = 0;
+  for (int k = 0; k < 3; k++) {
+    double side = a[k] < b[k] ? (double)b[k] - a[k] : (double)a[k] - b[k];
+    volume *= side;
+    longest = TRB_MAX(side, longest);
+  }
+  return longest > TRB_TINY ? volume : 0;
 }
 static inline int paper_largest_edge(const float v[3][3], double *volume)   /* from corner i to the next one */
 {

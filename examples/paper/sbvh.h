@@ -96,7 +96,8 @@ static inline int paper_polygon(const paper_build *p, const trbvh_node *box, flo
 static inline void paper_chop_edge(paper_bins *b, const float *from, const float *to, int i, int end)
 {
   const int k = b->axis, u = (k + 1) % 3, v = (k + 2) % 3;
-  float scale = 1 / (to[k] - from[k]), at_u = from[u], at_v = from[v], size_u = to[u] - at_u, size_v = to[v] - at_v;
+  float at_u = from[u], at_v = from[v], size_u = to[u] - at_u, size_v = to[v] - at_v;
+  float scale = i < end ? 1 / (to[k] - from[k]) : 0;
   for (;; i++) {
     trbvh_node *bin = &b->bin[i];
     float next_u = to[u], next_v = to[v];
@@ -170,6 +171,7 @@ static inline void paper_sweep_bins(paper_bins *b, const paper_task *t, paper_pl
   paper_sum_bins(b);
   for (int i = 1; i < b->count; i++) {
     const trbvh_node *left = &b->left[i], *right = &b->right[i];
+    if (b->plane[i] <= b->plane[0] || b->plane[i] >= b->plane[b->count]) continue;   /* rounded: not between them */
     if (left->count == 0 || right->count == 0 || left->count + right->count - (t->end - t->begin) > t->budget) continue;
     double cost = paper_cost_of(left, right);
     if (cost < best->cost) *best = (paper_plane){cost, b->axis, b->plane[i]};
@@ -182,6 +184,7 @@ static inline void paper_refine(paper_splitter *s, const paper_task *t, const pa
   paper_bins *b = &s->fine;
   const int k = coarse->axis;
   float low = coarse->plane[i], high = coarse->plane[i + 1];
+  if (!(high - low > TRB_TINY)) return;
   paper_start_bins(b, k, low, high, PAPER_STRIDE);
   b->left[0] = coarse->left[i];
   b->right[PAPER_STRIDE] = coarse->right[i + 1];
@@ -422,9 +425,9 @@ static inline void paper_sbvh_build(paper_splitter *s)
     now.depth++;
   }
 }
-static inline void paper_sbvh(paper_build *p)
+static inline paper_splitter *paper_start_sbvh(paper_build *p)
 {
-  static const paper_sbvh_settings usual = {1e-5f, 128, 1};
+  static const paper_sbvh_settings usual = {1e-5f, PAPER_BINS, 1};
   uint32_t room = p->ref_max;
   paper_splitter *s = (paper_splitter *)ex_allocate(1, sizeof *s);
   s->p = s->sweep.p = p;
@@ -437,10 +440,11 @@ static inline void paper_sbvh(paper_build *p)
   s->halves = (trbvh_node *)ex_allocate((size_t)room + 1, sizeof *s->halves);
   for (int k = 0; k < 2; k++) s->keys[k] = (uint64_t *)ex_allocate(room, sizeof(uint64_t));
   paper_sort_centers(&s->sweep);
-  trbvh_node box = paper_box_of(s, 0, 0, p->ref_count);
-  s->least_overlap = s->settings.alpha * trb_area(box);
-  paper_sbvh_build(s);
-  paper_fit(p);
+  s->least_overlap = s->settings.alpha * trb_area(paper_box_of(s, 0, 0, p->ref_count));
+  return s;
+}
+static inline void paper_end_sbvh(paper_splitter *s)
+{
   for (int axis = 0; axis < 3; axis++) free(s->sweep.order[axis]);
   for (int k = 0; k < 2; k++) free(s->keys[k]);
   free(s->sweep.spare);
@@ -449,6 +453,13 @@ static inline void paper_sbvh(paper_build *p)
   free(s->cut);
   free(s->halves);
   free(s);
+}
+static inline void paper_sbvh(paper_build *p)
+{
+  paper_splitter *s = paper_start_sbvh(p);
+  paper_sbvh_build(s);
+  paper_fit(p);
+  paper_end_sbvh(s);
 }
 
 #endif
