@@ -33,7 +33,9 @@ static inline uint32_t paper_new_pair(paper_build *p) { return 2 * p->pair_end++
 /* The box around a and b; what else is in it is a's. */
 static inline trbvh_node paper_union(trbvh_node a, const trbvh_node *b)
 {
-  trb_include(&a, b->min, b->max);
+  a.min[0] = TRB_MIN(b->min[0], a.min[0]); a.max[0] = TRB_MAX(b->max[0], a.max[0]);
+  a.min[1] = TRB_MIN(b->min[1], a.min[1]); a.max[1] = TRB_MAX(b->max[1], a.max[1]);
+  a.min[2] = TRB_MIN(b->min[2], a.min[2]); a.max[2] = TRB_MAX(b->max[2], a.max[2]);
   return a;
 }
 /* The parent of the pair at `first`, where it stands. */
