@@ -57,6 +57,15 @@ static inline void paper_set_inner(paper_build *p, uint32_t slot, uint32_t first
   p->nodes[slot].first = first;
   p->nodes[slot].count = 0;
 }
+/* For builders from the bottom up: makes l and r siblings, and returns their parent, which has no place yet. What
+ * is left of all goes to nodes[0]. */
+static inline trbvh_node paper_join(paper_build *p, trbvh_node l, trbvh_node r)
+{
+  uint32_t first = paper_new_pair(p);
+  p->nodes[first] = l;
+  p->nodes[first + 1] = r;
+  return trb_parent(l, r, first, p->lib.costs);
+}
 /* A reference with another box. */
 static inline trbvh_node paper_reference(const paper_build *p, trbvh_node box, uint32_t prim)
 {
@@ -128,6 +137,36 @@ static inline uint64_t *paper_sort_refs(paper_build *p)
   free(sorted);
   free(codes);
   return keys;
+}
+
+/* Goes through the binary radix tree over the sorted references (Karras 2012), children before parents. Each node
+ * takes over what its children have left, refs[begin..end - 1]; `reduce` puts what that becomes at begin, and
+ * returns its end. `split` is what parts the children, larger nearer to the root: the exclusive or of the codes on
+ * either side with bit 63 set, or, of equal codes, that of the references' places. Returns the end of what the
+ * root has left. */
+typedef uint32_t paper_reducer(paper_build *p, uint32_t begin, uint32_t end, uint64_t split);
+static inline uint64_t paper_split_after(const paper_build *p, const uint64_t *codes, uint32_t i)
+{
+  if (i + 1 == p->ref_count) return UINT64_MAX;
+  uint64_t code = codes[i] ^ codes[i + 1];
+  return code ? code | (uint64_t)1 << 63 : i ^ (i + 1);
+}
+static inline uint32_t paper_climb(paper_build *p, const uint64_t *codes, paper_reducer *reduce)
+{
+  struct { uint64_t split; uint32_t begin; } stack[96];   /* subtrees that wait for what is right of them */
+  uint32_t waiting = 0, end = 0;
+  for (uint32_t i = 0; i < p->ref_count; i++) {
+    uint64_t split = paper_split_after(p, codes, i);
+    uint32_t begin = end;
+    p->refs[end++] = p->refs[i];
+    while (waiting && stack[waiting - 1].split <= split) {
+      begin = stack[--waiting].begin;
+      end = reduce(p, begin, end, stack[waiting].split);
+    }
+    stack[waiting].split = split;
+    stack[waiting++].begin = begin;
+  }
+  return end;
 }
 
 /* trbvh's own linear BVH over the references, a builder like the others: what builders that split use, and those that
