@@ -32,8 +32,8 @@ static inline void ex_clear_progress(void) { if (isatty(2)) fprintf(stderr, "\r%
 /* Made by formula, so that a program measures something anywhere: first those of different character, then inputs that
  * may be slow to build. */
 typedef enum ex_kind {
-  EX_TERRAIN, EX_CITY, EX_CITY_TILTED, EX_ROOMS, EX_ROCK, EX_ISLAND, EX_FOREST, EX_HAIR, EX_MACHINE, EX_SOUP, EX_SLIVERS,
-  EX_IDENTICAL, EX_SORTED, EX_REVERSED, EX_TWO_CENTERS, EX_OUTLIER, EX_GEOMETRIC, EX_SCENES
+  EX_TERRAIN, EX_CITY, EX_CITY_TILTED, EX_ROOMS, EX_ROCK, EX_ISLAND, EX_FOREST, EX_HAIR, EX_MACHINE, EX_SOUP,
+  EX_SLIVERS, EX_IDENTICAL, EX_SORTED, EX_REVERSED, EX_TWO_CENTERS, EX_OUTLIER, EX_GEOMETRIC, EX_SCENES
 } ex_kind;
 static const char *const ex_scene_names[EX_SCENES] = {
   "terrain", "city", "city, tilted", "rooms", "rock", "island", "forest", "hair", "machine", "soup", "slivers",
@@ -95,9 +95,10 @@ static inline void ex_add_rooms(ex_builder *b, uint32_t count)
     ex_vec corner = ex_v(6 * (float)(i % side), 0, 6 * (float)(i / side)), center = ex_add(corner, ex_v(3, 0, 3));
     for (int wall = 0; wall < 2; wall++) {   /* each in two, and what is above the door */
       ex_vec along = wall ? ex_v(0, 0, 1) : ex_v(1, 0, 0), across = wall ? ex_v(0.05f, 0, 0) : ex_v(0, 0, 0.05f);
-      ex_add_box(b, ex_mad(ex_add(corner, ex_v(0, 1.5f, 0)), along, 1), along, ex_v(0, 1.5f, 0), across);
-      ex_add_box(b, ex_mad(ex_add(corner, ex_v(0, 1.5f, 0)), along, 4.5f), ex_scale(along, 1.5f), ex_v(0, 1.5f, 0), across);
-      ex_add_box(b, ex_mad(ex_add(corner, ex_v(0, 2.5f, 0)), along, 2.5f), ex_scale(along, 0.5f), ex_v(0, 0.5f, 0), across);
+      ex_vec up = ex_v(0, 1.5f, 0), middle = ex_add(corner, up), lintel = ex_v(0, 0.5f, 0);
+      ex_add_box(b, ex_mad(middle, along, 1), along, up, across);
+      ex_add_box(b, ex_mad(middle, along, 4.5f), ex_scale(along, 1.5f), up, across);
+      ex_add_box(b, ex_mad(ex_mad(middle, lintel, 2), along, 2.5f), ex_scale(along, 0.5f), lintel, across);
     }
     ex_add_block(b, ex_add(center, ex_v(0, 0.75f, 0)), 0.9f, 0.03f, 0.6f);
     for (int k = 0; k < 4; k++) {
@@ -138,7 +139,9 @@ static inline void ex_add_hair(ex_builder *b, uint32_t count)
 /* A plate with screws, pipes and wheels of many sizes on it: large flat triangles beside tiny ones. */
 static inline void ex_add_machine(ex_builder *b, uint32_t count)
 {
-  static const ex_vec screw[] = {{0, 1, 0}, {0.8f, 1, 0}, {1, 0.8f, 0}, {1, 0.4f, 0}, {0.5f, 0.4f, 0}, {0.5f, -1, 0}, {0, -1, 0}};
+  static const ex_vec screw[] = {
+    {0, 1, 0}, {0.8f, 1, 0}, {1, 0.8f, 0}, {1, 0.4f, 0}, {0.5f, 0.4f, 0}, {0.5f, -1, 0}, {0, -1, 0}
+  };
   uint32_t seed = 6;
   ex_add_block(b, ex_v(0, -0.5f, 0), 20, 0.5f, 14);
   while (b->mesh.triangle_count < count && !b->failed) {

@@ -74,8 +74,9 @@ static inline void paper_add_primary(ex_ray_set *set, const ex_camera *camera, u
   for (uint32_t i = 0, found = 0; found < width * height; i++) {
     uint32_t x = paper_even_bits(i), y = paper_even_bits(i >> 1);
     if (x >= width || y >= height) continue;
+    float across = ((float)x + 0.5f) / (float)width, down = ((float)y + 0.5f) / (float)height;
+    set->rays[set->count++] = ex_camera_ray(camera, across, down);
     found++;
-    set->rays[set->count++] = ex_camera_ray(camera, ((float)x + 0.5f) / (float)width, ((float)y + 0.5f) / (float)height);
   }
 }
 /* From one hit: so many of each kind, by Halton's points, turned by a random number. */
@@ -92,8 +93,8 @@ static inline void paper_add_secondary(ex_ray_set sets[EX_KINDS], const ex_scene
     }
   }
 }
-/* Rays that start near one another and point the same way come one after the other: by a Morton code of the six numbers,
- * five bits of each. */
+/* Rays that start near one another and point the same way come one after the other: by a Morton code of the six
+ * numbers, five bits of each. */
 static inline void paper_sort_rays(ex_ray_set *set, ex_vec low, ex_vec high)
 {
   uint64_t *keys = (uint64_t *)ex_allocate(set->count, sizeof *keys);
@@ -116,8 +117,8 @@ static inline void paper_sort_rays(ex_ray_set *set, ex_vec low, ex_vec high)
   set->rays = sorted;
   free(keys);
 }
-/* A scene's: primary ones from the cameras, and from each hit so many samples of ambient occlusion, as far as a tenth of
- * the diagonal, and as many diffuse ones without a limit. The caller frees the sets' rays. */
+/* A scene's: primary ones from the cameras, and from each hit so many samples of ambient occlusion, as far as a tenth
+ * of the diagonal, and as many diffuse ones without a limit. The caller frees the sets' rays. */
 static inline void paper_make_rays(const ex_scene *scene, const trbvh *bvh, uint32_t width, uint32_t height,
                                    uint32_t samples, ex_ray_set sets[EX_KINDS])
 {
@@ -142,10 +143,10 @@ static inline void paper_make_rays(const ex_scene *scene, const trbvh *bvh, uint
 }
 
 // >>end-point overlap ---------------------------------------------------------------------------------------
-/* EPO = sum over nodes n of C(n) A(surfaces in box(n) that are not in subtree(n)) / A(all surfaces), with C = Ci for inner
- * nodes and Ct N for leaves: what it costs to end a ray anywhere on the surface, beside the way to it. As an integral over
- * the surface it is the mean over points of it of the C(n) of the boxes around the point whose subtrees do not have the
- * point's triangle, which these points, spread evenly, estimate. */
+/* EPO = sum over nodes n of C(n) A(surfaces in box(n) that are not in subtree(n)) / A(all surfaces), with C = Ci for
+ * inner nodes and Ct N for leaves: what it costs to end a ray anywhere on the surface, beside the way to it. As an
+ * integral over the surface it is the mean over points of it of the C(n) of the boxes around the point whose subtrees
+ * do not have the point's triangle, which these points, spread evenly, estimate. */
 typedef struct paper_point { float at[3]; uint32_t prim; } paper_point;
 typedef struct paper_points { paper_point *at; size_t count; } paper_points;
 
@@ -182,7 +183,7 @@ static inline paper_points paper_make_points(const ex_mesh *mesh, size_t count)
 /* Where a tree has which primitive: a subtree's primitives are a range of prims[]. */
 typedef struct paper_places {
   uint32_t *begin, *end;               /* by node */
-  uint32_t *first, *entries;           /* a primitive's entries of prims[]: from entries[first[prim]] to first[prim + 1] */
+  uint32_t *first, *entries;           /* where prims[] has a primitive: entries[first[prim]] to first[prim + 1] */
 } paper_places;
 static inline paper_places paper_find_places(const trbvh *bvh)
 {
@@ -242,12 +243,13 @@ static inline double paper_epo(const trbvh *bvh, const paper_points *points)
 }
 
 // >>visits --------------------------------------------------------------------------------------------------
-/* Per ray (every step-th), up to its hit: nodes whose boxes it meets, triangles in the leaves among them; and leaf count variability, the
- * standard deviation of the number of these leaves, which tells how badly rays fit each other on SIMD units. */
+/* Per ray, of every step-th, up to its hit: nodes whose boxes it meets, triangles in the leaves among them; and leaf
+ * count variability, the standard deviation of the number of these leaves, which tells how badly rays fit each other on
+ * SIMD units. */
 typedef struct paper_visits { double nodes, triangles, lcv; } paper_visits;
 
-static inline paper_visits paper_count_visits(const trbvh *bvh, const trbvh_ray *rays, const trbvh_hit *hits, size_t count,
-                                              size_t step)
+static inline paper_visits paper_count_visits(const trbvh *bvh, const trbvh_ray *rays, const trbvh_hit *hits,
+                                              size_t count, size_t step)
 {
   paper_visits v = {0, 0, 0};
   double leaves = 0, squares = 0, traced = 0;

@@ -1,4 +1,5 @@
-/* plot.h - diagrams as SVG files: points with a front, bars, curves. Text is the reader's font; no script, no style sheet. */
+/* plot.h - diagrams as SVG files: points with a front, bars, curves. Text is in the reader's font; no script, no style
+ * sheet. */
 #ifndef PAPER_PLOT_H
 #define PAPER_PLOT_H
 #include "../common.h"
@@ -12,18 +13,28 @@ typedef struct paper_plot {
 } paper_plot;
 typedef struct paper_label { double x, y; const char *text, *color; int front; } paper_label;
 
-static const char *const paper_colors[] = {"#4477aa", "#ee6677", "#228833", "#aa7700", "#66ccee", "#aa3377", "#777777", "#000000"};
-static inline const char *paper_color(int i) { return paper_colors[i % (int)(sizeof paper_colors / sizeof *paper_colors)]; }
+enum { PAPER_COLORS = 8 };
+static const char *const paper_colors[PAPER_COLORS] = {
+  "#4477aa", "#ee6677", "#228833", "#aa7700", "#66ccee", "#aa3377", "#777777", "#000000"
+};
+static inline const char *paper_color(int i) { return paper_colors[i % PAPER_COLORS]; }
 
 static inline double paper_along(paper_axis a, double value)   /* 0..1 */
 {
   return a.log ? log(value / a.low) / log(a.high / a.low) : (value - a.low) / (a.high - a.low);
 }
-static inline double paper_x(const paper_plot *p, double value) { return p->left + p->width * paper_along(p->x, value); }
-static inline double paper_y(const paper_plot *p, double value) { return p->top + p->height * (1 - paper_along(p->y, value)); }
+static inline double paper_x(const paper_plot *p, double value)
+{
+  return p->left + p->width * paper_along(p->x, value);
+}
+static inline double paper_y(const paper_plot *p, double value)
+{
+  return p->top + p->height * (1 - paper_along(p->y, value));
+}
 
 /* anchor: start, middle or end */
-static inline void paper_text(const paper_plot *p, double x, double y, const char *anchor, const char *color, const char *text)
+static inline void paper_text(const paper_plot *p, double x, double y, const char *anchor, const char *color,
+                              const char *text)
 {
   fprintf(p->file, "<text x=\"%.1f\" y=\"%.1f\" text-anchor=\"%s\" fill=\"%s\">", x, y, anchor, color);
   for (; *text; text++) {
@@ -33,10 +44,11 @@ static inline void paper_text(const paper_plot *p, double x, double y, const cha
   }
   fputs("</text>\n", p->file);
 }
-static inline void paper_line(const paper_plot *p, double x1, double y1, double x2, double y2, const char *color, double width)
+static inline void paper_line(const paper_plot *p, double x1, double y1, double x2, double y2, const char *color,
+                              double width)
 {
-  fprintf(p->file, "<line x1=\"%.1f\" y1=\"%.1f\" x2=\"%.1f\" y2=\"%.1f\" stroke=\"%s\" stroke-width=\"%.1f\"/>\n", x1, y1,
-          x2, y2, color, width);
+  fprintf(p->file, "<line x1=\"%.1f\" y1=\"%.1f\" x2=\"%.1f\" y2=\"%.1f\" stroke=\"%s\" stroke-width=\"%.1f\"/>\n",
+          x1, y1, x2, y2, color, width);
 }
 static inline void paper_open_plot(paper_plot *p, const char *path, double width, double height)
 {
@@ -65,7 +77,7 @@ static inline void paper_tick(const paper_plot *p, int vertical, double value)
     paper_text(p, x, p->top + p->height + 16, "middle", "#444444", text);
   }
 }
-/* On a logarithmic axis at powers of ten, and at 2 and 5 times them where it is short; else at some five round numbers. */
+/* On a logarithmic axis at powers of ten, and at 2 and 5 times them where it is short; else at some round numbers. */
 static inline void paper_ticks(const paper_plot *p, int vertical)
 {
   paper_axis a = vertical ? p->y : p->x;
@@ -81,15 +93,16 @@ static inline void paper_ticks(const paper_plot *p, int vertical)
   } else {
     double step = pow(10, floor(log10((a.high - a.low) / 2)));
     if ((a.high - a.low) / step > 10) step *= 2;
-    for (double value = ceil(a.low / step) * step; value <= a.high + step / 1e3; value += step) paper_tick(p, vertical, value);
+    double value = ceil(a.low / step) * step;
+    for (; value <= a.high + step / 1e3; value += step) paper_tick(p, vertical, value);
   }
 }
 static inline void paper_frame(const paper_plot *p)
 {
   paper_ticks(p, 0);
   paper_ticks(p, 1);
-  fprintf(p->file, "<rect x=\"%.1f\" y=\"%.1f\" width=\"%.1f\" height=\"%.1f\" fill=\"none\" stroke=\"#444444\"/>\n", p->left,
-          p->top, p->width, p->height);
+  fprintf(p->file, "<rect x=\"%.1f\" y=\"%.1f\" width=\"%.1f\" height=\"%.1f\" fill=\"none\" stroke=\"#444444\"/>\n",
+          p->left, p->top, p->width, p->height);
   paper_text(p, p->left + p->width / 2, p->top + p->height + 36, "middle", "#000000", p->x.title);
   paper_text(p, p->left, p->top - 10, "start", "#000000", p->y.title);
 }
@@ -105,8 +118,8 @@ static inline void paper_spread(paper_label *labels, int count, double wide, dou
   }
   for (int i = 1; i < count; i++) {
     for (int k = 0; k < i; k++) {
-      int aside = fabs(labels[i].x - labels[k].x) > wide;
-      if (!aside && labels[i].y < labels[k].y + high && labels[i].y > labels[k].y - high) labels[i].y = labels[k].y + high;
+      double aside = fabs(labels[i].x - labels[k].x), below = labels[i].y - labels[k].y;
+      if (aside <= wide && below < high && below > -high) labels[i].y = labels[k].y + high;
     }
   }
 }
@@ -126,7 +139,10 @@ static inline void paper_plot_points(paper_plot *p, paper_label *points, int cou
     points[i].front = more ? points[i].y > best : points[i].y < best;
     if (!points[i].front) continue;
     best = points[i].y;
-    if (last) paper_line(p, paper_x(p, last->x), paper_y(p, last->y), paper_x(p, points[i].x), paper_y(p, points[i].y), "#ee6677", 2);
+    if (last) {
+      double x = paper_x(p, points[i].x), y = paper_y(p, points[i].y);
+      paper_line(p, paper_x(p, last->x), paper_y(p, last->y), x, y, "#ee6677", 2);
+    }
     last = &points[i];
   }
   for (int i = 0; i < count; i++) {

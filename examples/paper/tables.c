@@ -1,13 +1,13 @@
-/* tables.c - the two tables of Karras and Aila (HPG 2013), made again: what trbvh and every builder that the paper compares
- * with give and cost, on your meshes or on built-in scenes; with the metrics that explain it, the rate of rays when the
- * build is counted, and Embree's builders, where it is linked. Introduces: all of paper.h's builders.
+/* tables.c - the two tables of Karras and Aila (HPG 2013), made again: what trbvh and every builder that the paper
+ * compares it with give and cost, on your meshes or on built-in scenes; with the metrics that explain it, the rate of
+ * rays when the build is counted, and Embree's builders, where it is linked. Introduces: all of paper.h's builders.
  *
  *   cc -O2 examples/paper/tables.c -o tables -lm -pthread && ./tables --quick
  *   cc -O2 -DEX_EMBREE=3 examples/paper/tables.c -o tables -lembree3 -lm -pthread     (or 4, and -lembree4)
  *   ./tables --scenes meshes/ --out results/
  *
- * For each scene all trees are made first, then traced in turn, so that noise hits all alike; medians count. All give the
- * very same hits, which is checked. Needs POSIX, or MinGW.
+ * For each scene all trees are made first, then traced in turn, so that noise hits all alike; medians count. All give
+ * the very same hits, which is checked. Needs POSIX, or MinGW.
  */
 #define _DEFAULT_SOURCE                /* with -std=c99 too: large pages for the library */
 #define TRBVH_THREADS
@@ -61,7 +61,7 @@ typedef struct builder {
   double paper[2][FIGURES];            /* by table; 0: not known, or not in it */
 } builder;
 
-static const paper_bittner_settings from_sweep = {.start = paper_sweep};
+static const paper_moves_settings from_sweep = {.start = paper_sweep};
 #ifdef EX_EMBREE
 static ex_embree peer;                 /* started for the mesh at hand */
 static const paper_embree_parameters embree_low = {&peer, RTC_BUILD_QUALITY_LOW};
@@ -71,7 +71,8 @@ static const paper_embree_parameters embree_high = {&peer, RTC_BUILD_QUALITY_HIG
 /* The rows of the tables, in their order. The paper's figures: its tables 1 and 2. */
 static const builder builders[] = {
   {"SweepSAH", "sweep", FIRST_TABLE, paper_sweep, NULL, 0, 0, -1, 3500, {{100, 100, 100}, {0}}},
-  {"TRBVH", "trbvh", FIRST_TABLE | SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, -1, 200, {{96.0, 94.4, 1.03}, {76.5, 111.5, 0.14}}},
+  {"TRBVH", "trbvh", FIRST_TABLE | SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, -1, 200,
+   {{96.0, 94.4, 1.03}, {76.5, 111.5, 0.14}}},
   {"LBVH", "lbvh", FIRST_TABLE, NULL, NULL, TRBVH_QUALITY_FAST, 0, -1, 60, {{69.4, 131.5, 0.28}, {0}}},
   {"HLBVH", "hlbvh", FIRST_TABLE, paper_hlbvh, NULL, 0, 0, -1, 300, {{67.4, 129.3, 0.57}, {0}}},
   {"GridSAH", "grid", FIRST_TABLE, paper_grid, NULL, 0, 0, -1, 500, {{68.1, 129.1, 0.70}, {0}}},
@@ -86,10 +87,14 @@ static const builder builders[] = {
   {"Embree MEDIUM", "embree-medium", FIRST_TABLE, paper_embree, &embree_medium, 0, 0, -1, 600, {{0}, {0}}},
 #endif
   {"SBVH", "sbvh", SECOND_TABLE, paper_sbvh, NULL, 0, 0, 2, 6000, {{0}, {100, 100, 100}}},
-  {"TRBVH, 10 % splits", "trbvh-10", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, 0.1f, 300, {{0}, {87.2, 108.8, 0.15}}},
-  {"TRBVH, 30 %", "trbvh-30", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, 0.3f, 350, {{0}, {91.0, 108.0, 0.17}}},
-  {"TRBVH, 50 %", "trbvh-50", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, 0.5f, 400, {{0}, {92.5, 108.3, 0.20}}},
-  {"TRBVH, as SBVH", "trbvh-match", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, MATCH_SBVH, 400, {{0}, {90.7, 107.4, 0.16}}},
+  {"TRBVH, 10 % splits", "trbvh-10", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, 0.1f, 300,
+   {{0}, {87.2, 108.8, 0.15}}},
+  {"TRBVH, 30 %", "trbvh-30", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, 0.3f, 350,
+   {{0}, {91.0, 108.0, 0.17}}},
+  {"TRBVH, 50 %", "trbvh-50", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, 0.5f, 400,
+   {{0}, {92.5, 108.3, 0.20}}},
+  {"TRBVH, as SBVH", "trbvh-match", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, MATCH_SBVH, 400,
+   {{0}, {90.7, 107.4, 0.16}}},
   {"ESC, as SBVH", "esc", SECOND_TABLE, paper_esc, NULL, 0, 3, MATCH_SBVH, 1500, {{0}, {0}}},
   {"EVH, as SBVH", "evh", SECOND_TABLE, paper_evh, NULL, 0, 3, MATCH_SBVH, 1500, {{0}, {0}}},
 #ifdef EX_EMBREE
@@ -131,7 +136,6 @@ typedef struct tables {
   ex_inputs inputs;
   scene_results *scenes;
   ex_progress progress;                /* in ns of expected work */
-  double naive_us, dp_us;              /* a treelet; 0: not measured */
 } tables;
 
 static int row_of(const char *key)     /* BUILDERS where there is none */
@@ -156,16 +160,18 @@ static double expected_ns(const tables *t, double triangles)
 // >>building ------------------------------------------------------------------------------------------------
 static trbvh_options options_of(const builder *of, const scene_results *s, trbvh_stats *stats)
 {
-  trbvh_options options = {.quality = (trbvh_quality)of->quality, .treelet_rounds = of->rounds, .split_budget = of->splits,
-                           .stats = stats};
+  trbvh_options options = {.quality = (trbvh_quality)of->quality, .stats = stats};
+  options.treelet_rounds = of->rounds;
+  options.split_budget = of->splits;
   if (of->splits == MATCH_SBVH) {
     double more = s->rows[base_of(SECOND_TABLE)].references / s->triangles - 1;
     options.split_budget = more > 0 ? (float)more : -1;
   }
   return options;
 }
-/* Of trbvh's own: as an engine does that rebuilds, into the same tree with its memory kept. Median of the repetitions. */
-static double build_own(const tables *t, trbvh *tree, const trbvh_geometry *geometry, trbvh_options options, uint32_t threads)
+/* Of trbvh's own: as an engine does that rebuilds, into the same tree with its memory kept. Median of repetitions. */
+static double build_own(const tables *t, trbvh *tree, const trbvh_geometry *geometry, trbvh_options options,
+                        uint32_t threads)
 {
   double ms[REPS_MAX];
   options.jobs.width = threads;
@@ -190,7 +196,7 @@ static double build_other(const tables *t, const builder *of, trbvh *tree, const
     ex_check(paper_make(tree, geometry, options, of->make, of->parameters, &r->references), of->name, options->stats);
     all += ms[count++] = ex_now_ms() - start;
 #ifdef EX_EMBREE
-    if (of->make == paper_embree) ms[count - 1] = peer.ms;   /* without what we make of its tree; below 0 where it has none */
+    if (of->make == paper_embree) ms[count - 1] = peer.ms;   /* its part of it; below 0 where it has no tree */
 #endif
   } while (count < t->reps && all < 300);
   return ex_median(ms, count);
@@ -215,17 +221,37 @@ static void build(const tables *t, int row, trbvh *tree, const trbvh_geometry *g
   r->made = r->ms[0] > 0;
 }
 
-/* The same best topology found in two ways, on treelets of the first scene. */
-static void measure_treelets(tables *t)
+/* A builder that makes LBVH, and of its treelets the best topologies, in two ways. */
+static double naive_us, dynamic_us;    /* a treelet */
+static void time_treelets(paper_build *p)
 {
-  (void)t;
+  enum { TREELETS = 64 * TRB_LANES, NAIVE = 16 };
+  paper_treelet *treelets = (paper_treelet *)ex_allocate(TREELETS, sizeof *treelets);
+  float naive[NAIVE], dynamic[TREELETS];
+  paper_lbvh(p);
+  if (paper_sample_treelets(p, treelets, TREELETS) == TREELETS) {
+    double start = ex_now_ms();
+    for (int i = 0; i < NAIVE; i++) naive[i] = paper_treelet_naive(&treelets[i], p->lib.costs, NULL);
+    naive_us = (ex_now_ms() - start) * 1e3 / NAIVE;
+    for (int rep = 0; rep < 2; rep++) {   /* the first one warms up */
+      start = ex_now_ms();
+      for (uint32_t i = 0; i < TREELETS; i += TRB_LANES) paper_treelets_dp(&treelets[i], p->lib.costs, &dynamic[i]);
+      dynamic_us = (ex_now_ms() - start) * 1e3 / TREELETS;
+    }
+    for (int i = 0; i < NAIVE; i++) {
+      if (fabsf(naive[i] - dynamic[i]) <= 1e-4f * naive[i]) continue;
+      ex_die("the dynamic program has found %g, the recursion %g", dynamic[i], naive[i]);
+    }
+  }
+  free(treelets);
 }
 
 // >>tracing -------------------------------------------------------------------------------------------------
 /* What the rays hit, by the first tree, and room for what they hit by another one. */
 typedef struct answers { trbvh_hit *hits[EX_KINDS], *again; uint8_t *occluded, *occluded_again; } answers;
 
-static double trace_ms(const trbvh *tree, int kind, const ex_ray_set *set, uint32_t threads, trbvh_hit *hits, uint8_t *occluded)
+static double trace_ms(const trbvh *tree, int kind, const ex_ray_set *set, uint32_t threads, trbvh_hit *hits,
+                       uint8_t *occluded)
 {
   trbvh_options options = {.jobs = {.width = threads}};
   double start = ex_now_ms();
@@ -288,9 +314,12 @@ static void trace(tables *t, const trbvh *trees, const ex_ray_set sets[EX_KINDS]
 }
 #ifdef EX_EMBREE
 /* What an Embree user gets: its own scene, nodes and traversal. */
-static void measure_peers(const tables *t, const ex_mesh *mesh, const ex_ray_set sets[EX_KINDS], answers *a, scene_results *s)
+static void measure_peers(const tables *t, const ex_mesh *mesh, const ex_ray_set sets[EX_KINDS], answers *a,
+                          scene_results *s)
 {
-  static const enum RTCBuildQuality qualities[PEERS] = {RTC_BUILD_QUALITY_LOW, RTC_BUILD_QUALITY_MEDIUM, RTC_BUILD_QUALITY_HIGH};
+  static const enum RTCBuildQuality qualities[PEERS] = {
+    RTC_BUILD_QUALITY_LOW, RTC_BUILD_QUALITY_MEDIUM, RTC_BUILD_QUALITY_HIGH
+  };
   for (int i = 0; i < PEERS * t->turns; i++) {
     int turn = i / PEERS;
     uint32_t threads = t->threads[turn];
@@ -340,7 +369,9 @@ static void measure_scene(tables *t, const ex_input *in, scene_results *s)
 #ifdef EX_EMBREE
   ex_embree_stop(&peer);
 #endif
-  ex_check(trbvh_build(&first, &geometry, NULL), "building", NULL);
+  trbvh_options usual = {.allocator = {NULL, NULL, NULL}};
+  if (naive_us <= 0) ex_check(paper_make(&first, &geometry, &usual, time_treelets, NULL, NULL), "building", NULL);
+  ex_check(trbvh_build(&first, &geometry, &usual), "building", NULL);
   paper_make_rays(&scene, &first, t->width, t->height, t->samples, sets);
   paper_points points = paper_make_points(&mesh, t->quick ? 4096 : 32768);
   answers a = make_answers(&first, sets);
@@ -348,9 +379,10 @@ static void measure_scene(tables *t, const ex_input *in, scene_results *s)
   trace(t, trees, sets, &a, s);
   for (int i = 0; i < BUILDERS; i++) {
     if (!s->rows[i].made) continue;
-    size_t step = sets[EX_DIFFUSE].count / 20000 + 1;
+    const ex_ray_set *diffuse = &sets[EX_DIFFUSE];
+    size_t step = diffuse->count / 20000 + 1;
     s->rows[i].epo = paper_epo(&trees[i], &points);
-    s->rows[i].visits = paper_count_visits(&trees[i], sets[EX_DIFFUSE].rays, a.hits[EX_DIFFUSE], sets[EX_DIFFUSE].count, step);
+    s->rows[i].visits = paper_count_visits(&trees[i], diffuse->rays, a.hits[EX_DIFFUSE], diffuse->count, step);
     trbvh_free(&trees[i]);
   }
 #ifdef EX_EMBREE
@@ -367,13 +399,40 @@ static void measure_scene(tables *t, const ex_input *in, scene_results *s)
 // >>figures -------------------------------------------------------------------------------------------------
 static int in_table(const tables *t, int row, int table) { return t->wanted[row] && (builders[row].tables & table); }
 
+/* One of these figures, of one builder and scene, beside what the table is relative to. */
+typedef struct view { const result *of, *base; double triangles; } view;
+typedef double measure(view v);
+
+static double ratio(double a, double b) { return b > 0 ? 100 * a / b : 0; }
+static double rates_ratio(view v, int turn, int kind) { return ratio(v.of->rates[turn][kind], v.base->rates[turn][kind]); }
+static double performance(view v) { return rates_ratio(v, 0, EX_DIFFUSE); }
+static double performance_n(view v) { return rates_ratio(v, 1, EX_DIFFUSE); }
+static double primary(view v) { return rates_ratio(v, 0, EX_PRIMARY); }
+static double ambient(view v) { return rates_ratio(v, 0, EX_AMBIENT); }
+static double sah(view v) { return ratio(v.of->stats.sah_cost, v.base->stats.sah_cost); }
+static double build_time(view v) { return ratio(v.of->ms[0], v.base->ms[0]); }
+static double references(view v) { return ratio(v.of->stats.ref_count, v.triangles); }
+static double epo(view v) { return ratio(v.of->epo, v.base->epo); }
+static double lcv(view v) { return ratio(v.of->visits.lcv, v.base->visits.lcv); }
+static double nodes(view v) { return ratio(v.of->visits.nodes, v.base->visits.nodes); }
+static double triangles(view v) { return ratio(v.of->visits.triangles, v.base->visits.triangles); }
+static double depth(view v) { return v.of->stats.max_depth; }
+static double ns_per_triangle(view v) { return v.of->ms[0] * 1e6 / v.triangles; }
+static double ns_per_triangle_n(view v) { return v.of->ms[1] * 1e6 / v.triangles; }
+static double million_rays(view v) { return v.of->rates[0][EX_DIFFUSE]; }
+static double million_rays_n(view v) { return v.of->rates[1][EX_DIFFUSE]; }
+
+static double value_of(const scene_results *s, measure *of, int row, int table)   /* 0 where it is not known */
+{
+  view v = {&s->rows[row], &s->rows[base_of(table)], s->triangles};
+  return s->rows[row].made ? of(v) : 0;
+}
 /* Of all scenes; 0 where one of them has none. */
-typedef double measure(const scene_results *s, int row, int table);
 static double mean(const tables *t, measure *of, int row, int table)
 {
   double sum = 0;
   for (size_t i = 0; i < t->inputs.count; i++) {
-    double value = t->scenes[i].rows[row].made ? of(&t->scenes[i], row, table) : 0;
+    double value = value_of(&t->scenes[i], of, row, table);
     if (!(value > 0)) return 0;
     sum += value;
   }
@@ -383,60 +442,12 @@ static double geometric_mean(const tables *t, measure *of, int row, int table)
 {
   double sum = 0;
   for (size_t i = 0; i < t->inputs.count; i++) {
-    double value = t->scenes[i].rows[row].made ? of(&t->scenes[i], row, table) : 0;
+    double value = value_of(&t->scenes[i], of, row, table);
     if (!(value > 0)) return 0;
     sum += log(value);
   }
   return exp(sum / (double)t->inputs.count);
 }
-static double ratio(double a, double b) { return b > 0 ? 100 * a / b : 0; }
-static double rate_per_cent(const scene_results *s, int row, int table, int turn, int kind)
-{
-  return ratio(s->rows[row].rates[turn][kind], s->rows[base_of(table)].rates[turn][kind]);
-}
-static double performance(const scene_results *s, int row, int table) { return rate_per_cent(s, row, table, 0, EX_DIFFUSE); }
-static double performance_n(const scene_results *s, int row, int table) { return rate_per_cent(s, row, table, 1, EX_DIFFUSE); }
-static double primary(const scene_results *s, int row, int table) { return rate_per_cent(s, row, table, 0, EX_PRIMARY); }
-static double ambient(const scene_results *s, int row, int table) { return rate_per_cent(s, row, table, 0, EX_AMBIENT); }
-static double sah(const scene_results *s, int row, int table)
-{
-  return ratio(s->rows[row].stats.sah_cost, s->rows[base_of(table)].stats.sah_cost);
-}
-static double build_time(const scene_results *s, int row, int table)
-{
-  return ratio(s->rows[row].ms[0], s->rows[base_of(table)].ms[0]);
-}
-static double references(const scene_results *s, int row, int table)
-{
-  (void)table;
-  return 100 * s->rows[row].stats.ref_count / s->triangles;
-}
-static double epo(const scene_results *s, int row, int table) { return ratio(s->rows[row].epo, s->rows[base_of(table)].epo); }
-static double lcv(const scene_results *s, int row, int table)
-{
-  return ratio(s->rows[row].visits.lcv, s->rows[base_of(table)].visits.lcv);
-}
-static double nodes(const scene_results *s, int row, int table)
-{
-  return ratio(s->rows[row].visits.nodes, s->rows[base_of(table)].visits.nodes);
-}
-static double triangles(const scene_results *s, int row, int table)
-{
-  return ratio(s->rows[row].visits.triangles, s->rows[base_of(table)].visits.triangles);
-}
-static double depth(const scene_results *s, int row, int table) { (void)table; return s->rows[row].stats.max_depth; }
-static double ns_per_triangle(const scene_results *s, int row, int table)
-{
-  (void)table;
-  return s->rows[row].ms[0] * 1e6 / s->triangles;
-}
-static double ns_per_triangle_n(const scene_results *s, int row, int table)
-{
-  (void)table;
-  return s->rows[row].ms[1] * 1e6 / s->triangles;
-}
-static double million_rays(const scene_results *s, int row, int table) { (void)table; return s->rows[row].rates[0][EX_DIFFUSE]; }
-static double million_rays_n(const scene_results *s, int row, int table) { (void)table; return s->rows[row].rates[1][EX_DIFFUSE]; }
 
 /* Million rays/s when `rays` of them are traced and the build is counted, with one thread: R / (build + R / p). */
 static double effective(const result *r, double rays)
@@ -492,8 +503,8 @@ static void print_machine(FILE *out, const tables *t)
 #else
   const char *compiler = "unknown compiler";
 #endif
-  fprintf(out, "\n%s, %u threads; compiler %s; %u scenes; %ux%u rays from each of %d cameras, %u + %u from each hit; medians of "
-          "%d.\n", cpu, (unsigned)t->threads[t->turns - 1], compiler, (unsigned)t->inputs.count, (unsigned)t->width,
+  fprintf(out, "\n%s, %u threads; compiler %s; %u scenes; %ux%u rays from each of %d cameras, %u + %u from each hit; "
+          "medians of %d.\n", cpu, (unsigned)t->threads[t->turns - 1], compiler, (unsigned)t->inputs.count, (unsigned)t->width,
           (unsigned)t->height, PAPER_CAMERAS, (unsigned)t->samples, (unsigned)t->samples, t->reps);
 }
 /* As the paper's: averages over the scenes. */
@@ -524,8 +535,8 @@ static void print_columns(FILE *out, const tables *t, int table, const column *c
     if (!in_table(t, row, table)) continue;
     fprintf(out, "| %-*s |", NAME, builders[row].name);
     for (int i = 0; i < count; i++) {
-      double value = columns[i].geometric ? geometric_mean(t, columns[i].of, row, table) : mean(t, columns[i].of, row, table);
-      print_cell(out, 6, columns[i].decimals, value);
+      const column *c = &columns[i];
+      print_cell(out, 6, c->decimals, c->geometric ? geometric_mean(t, c->of, row, table) : mean(t, c->of, row, table));
     }
     fputs("\n", out);
   }
@@ -560,8 +571,7 @@ static void print_scenes(FILE *out, const tables *t, int table, const char *titl
   for (size_t i = 0; i < t->inputs.count; i++) {
     fprintf(out, "| %-24s |", t->scenes[i].name);
     for (int row = 0; row < BUILDERS; row++) {
-      const scene_results *s = &t->scenes[i];
-      if (in_table(t, row, table)) print_cell(out, 6, decimals, s->rows[row].made ? of(s, row, table) : 0);
+      if (in_table(t, row, table)) print_cell(out, 6, decimals, value_of(&t->scenes[i], of, row, table));
     }
     fputs("\n", out);
   }
@@ -577,16 +587,17 @@ static void print_stages(FILE *out, const tables *t)
     for (size_t i = 0; i < t->inputs.count; i++) {
       const scene_results *s = &t->scenes[i];
       const trbvh_stats *of = &s->rows[row].stats;
-      const double ms[7] = {of->ms_split, of->ms_morton, of->ms_sort, of->ms_hierarchy, of->ms_treelets, of->ms_collapse, of->ms_finish};
+      const double ms[7] = {of->ms_split, of->ms_morton, of->ms_sort, of->ms_hierarchy, of->ms_treelets,
+                            of->ms_collapse, of->ms_finish};
       for (int k = 0; k < 7; k++) sums[k] += ms[k] * 1e6 / s->triangles / (double)t->inputs.count;
     }
     fprintf(out, "| %-*s |", NAME, builders[row].name);
     for (int k = 0; k < 7; k++) print_cell(out, 6, 1, sums[k]);
     fputs("\n", out);
   }
-  if (t->naive_us > 0) {
-    fprintf(out, "\nThe best topology of a treelet of seven leaves: %.0f us by the naive recursion (1,149,877 calls), %.3f us by "
-            "the dynamic program: %.0f times as fast.\n", t->naive_us, t->dp_us, t->naive_us / t->dp_us);
+  if (naive_us > 0) {
+    fprintf(out, "\nThe best topology of a treelet of seven leaves: %.0f us by the naive recursion (1,149,877 calls), "
+            "%.3f us by the dynamic program: %.0f times as fast.\n", naive_us, dynamic_us, naive_us / dynamic_us);
   }
 }
 static int by_value(const void *a, const void *b)
@@ -603,10 +614,12 @@ static void print_rays(FILE *out, double rays)
 static void print_break_even(FILE *out, const tables *t)
 {
   static const char *const pairs[][2] = {
-    {"lbvh", "trbvh"}, {"trbvh", "sweep"}, {"trbvh", "bittner"}, {"trbvh", "trbvh-30"}, {"trbvh-30", "sbvh"}, {"trbvh", "sbvh"}
+    {"lbvh", "trbvh"}, {"trbvh", "sweep"}, {"trbvh", "bittner"}, {"trbvh", "trbvh-30"}, {"trbvh-30", "sbvh"},
+    {"trbvh", "sbvh"}
   };
   double *at = (double *)ex_allocate(t->inputs.count, sizeof *at);
-  fputs("\n### From how many rays on a slower build pays, one thread\n\n| | median of the scenes | first | last |\n|---|--:|--:|--:|\n", out);
+  fputs("\n### From how many rays on a slower build pays, one thread\n\n| | median of the scenes | first | last |\n"
+        "|---|--:|--:|--:|\n", out);
   for (size_t k = 0; k < sizeof pairs / sizeof *pairs; k++) {
     int rows[2] = {row_of(pairs[k][0]), row_of(pairs[k][1])};
     size_t count = 0;
@@ -640,10 +653,10 @@ static void print_break_even(FILE *out, const tables *t)
 static void print_peers(FILE *out, const tables *t)
 {
   if (!PEERS) return;
-  fprintf(out, "\n### Embree as its users get it: scenes of its own, rtcIntersect1 and rtcOccluded1\n\nGeometric means; trbvh's rows for "
-          "comparison. Million rays/s of primary, ambient occlusion and diffuse rays, with one thread and with all.\n\n"
-          "| %-*s | build, ns/triangle | primary | ambient occlusion | diffuse | all threads: build | primary | ambient occlusion "
-          "| diffuse |", NAME, "");
+  fprintf(out, "\n### Embree as its users get it: scenes of its own, rtcIntersect1 and rtcOccluded1\n\nGeometric means, beside "
+          "trbvh's. Million rays/s of primary, ambient occlusion and diffuse rays, with one thread and with all.\n\n"
+          "| %-*s | build, ns/triangle | primary | ambient occlusion | diffuse | all threads: build | primary | ambient "
+          "occlusion | diffuse |", NAME, "");
   print_rule(out, NAME, 8, 6);
   const int own[] = {row_of("lbvh"), row_of("trbvh")};
   for (int i = -2; i < PEERS; i++) {
@@ -697,9 +710,9 @@ static void close_file(FILE *file, const char *name) { if (fclose(file)) ex_die(
 static void write_csv(const tables *t)
 {
   FILE *csv = create("", t->csv_path);
-  fputs("scene,triangles,builder,references,leaves,depth,sah,epo,lcv,nodes_per_ray,triangles_per_ray,build_ms,build_ms_threads,"
-        "split_ms,morton_ms,sort_ms,hierarchy_ms,treelets_ms,collapse_ms,finish_ms,primary_mrays,ambient_mrays,diffuse_mrays,"
-        "primary_mrays_threads,ambient_mrays_threads,diffuse_mrays_threads", csv);
+  fputs("scene,triangles,builder,references,leaves,depth,sah,epo,lcv,nodes_per_ray,triangles_per_ray,build_ms,"
+        "build_ms_threads,split_ms,morton_ms,sort_ms,hierarchy_ms,treelets_ms,collapse_ms,finish_ms,primary_mrays,"
+        "ambient_mrays,diffuse_mrays,primary_mrays_threads,ambient_mrays_threads,diffuse_mrays_threads", csv);
   for (int k = 5; k <= 9; k++) fprintf(csv, ",effective_mrays_1e%d", k);
   fputs("\n", csv);
   for (size_t i = 0; i < t->inputs.count; i++) {
@@ -708,13 +721,14 @@ static void write_csv(const tables *t)
       const result *r = row < BUILDERS ? &s->rows[row] : &s->peers[row - BUILDERS];
       const trbvh_stats *of = &r->stats;
       const double values[] = {
-        s->triangles, of->ref_count, of->leaf_count, of->max_depth, of->sah_cost, r->epo, r->visits.lcv, r->visits.nodes,
-        r->visits.triangles, r->ms[0], r->ms[1], of->ms_split, of->ms_morton, of->ms_sort, of->ms_hierarchy, of->ms_treelets,
-        of->ms_collapse, of->ms_finish, r->rates[0][0], r->rates[0][1], r->rates[0][2], r->rates[1][0], r->rates[1][1], r->rates[1][2],
-        effective(r, 1e5), effective(r, 1e6), effective(r, 1e7), effective(r, 1e8), effective(r, 1e9)
+        s->triangles, of->ref_count, of->leaf_count, of->max_depth, of->sah_cost, r->epo, r->visits.lcv,
+        r->visits.nodes, r->visits.triangles, r->ms[0], r->ms[1], of->ms_split, of->ms_morton, of->ms_sort,
+        of->ms_hierarchy, of->ms_treelets, of->ms_collapse, of->ms_finish, r->rates[0][0], r->rates[0][1],
+        r->rates[0][2], r->rates[1][0], r->rates[1][1], r->rates[1][2], effective(r, 1e5), effective(r, 1e6), effective(r, 1e7), effective(r, 1e8), effective(r, 1e9)
       };
       if (!r->made) continue;
-      fprintf(csv, "\"%s\",%.0f,\"%s\"", s->name, values[0], row < BUILDERS ? builders[row].name : peer_names[row - BUILDERS]);
+      const char *name = row < BUILDERS ? builders[row].name : peer_names[row - BUILDERS];
+      fprintf(csv, "\"%s\",%.0f,\"%s\"", s->name, values[0], name);
       for (size_t k = 1; k < sizeof values / sizeof *values; k++) {
         if (values[k] > 0) fprintf(csv, ",%.6g", values[k]);
         else fputs(",", csv);
@@ -766,7 +780,7 @@ static void plot_scenes(const tables *t, const char *name)
   double bar = 7, group = bar * count + 8, most = 100;
   paper_plot p = {.left = 190, .top = 70, .width = 560, .height = group * (double)t->inputs.count};
   for (size_t i = 0; i < t->inputs.count; i++) {
-    for (int k = 0; k < count; k++) most = fmax(most, performance(&t->scenes[i], rows[k], FIRST_TABLE));
+    for (int k = 0; k < count; k++) most = fmax(most, value_of(&t->scenes[i], performance, rows[k], FIRST_TABLE));
   }
   p.x = (paper_axis){0, most > 300 ? 300 : most * 1.02, 0, "diffuse rays/s, % of SweepSAH"};
   p.y = (paper_axis){0, 1, 0, ""};
@@ -781,9 +795,9 @@ static void plot_scenes(const tables *t, const char *name)
     double top = p.top + group * (double)i;
     paper_text(&p, p.left - 8, top + group / 2, "end", "#000000", t->scenes[i].name);
     for (int k = 0; k < count; k++) {
-      double value = performance(&t->scenes[i], rows[k], FIRST_TABLE), x = fmin(value, p.x.high);
-      fprintf(p.file, "<rect x=\"%.0f\" y=\"%.1f\" width=\"%.1f\" height=\"%.1f\" fill=\"%s\"/>\n", p.left, top + 4 + bar * k,
-              p.width * x / p.x.high, bar - 1, paper_color(k));
+      double value = value_of(&t->scenes[i], performance, rows[k], FIRST_TABLE), x = fmin(value, p.x.high);
+      fprintf(p.file, "<rect x=\"%.0f\" y=\"%.1f\" width=\"%.1f\" height=\"%.1f\" fill=\"%s\"/>\n", p.left,
+              top + 4 + bar * k, p.width * x / p.x.high, bar - 1, paper_color(k));
       if (value <= x) continue;
       char text[32];
       snprintf(text, sizeof text, "%.0f", value);
@@ -810,10 +824,13 @@ static void plot_effective(const tables *t, const char *name)
       fprintf(p.file, "%.1f,%.1f ", paper_x(&p, pow(10, x)), paper_y(&p, effective_mean(t, rows[k], pow(10, x))));
     }
     fputs("\"/>\n", p.file);
-    labels[k] = (paper_label){p.left + p.width + 8, paper_y(&p, effective_mean(t, rows[k], 1e9)), builders[rows[k]].name, paper_color(k), 0};
+    double end = paper_y(&p, effective_mean(t, rows[k], 1e9));
+    labels[k] = (paper_label){p.left + p.width + 8, end, builders[rows[k]].name, paper_color(k), 0};
   }
   paper_spread(labels, count, 1, 14);
-  for (int k = 0; k < count; k++) paper_text(&p, labels[k].x, labels[k].y + 4, "start", labels[k].color, labels[k].text);
+  for (int k = 0; k < count; k++) {
+    paper_text(&p, labels[k].x, labels[k].y + 4, "start", labels[k].color, labels[k].text);
+  }
   paper_close_plot(&p);
 }
 static void copy_notes(FILE *out, const char *path)
@@ -839,9 +856,9 @@ static void write_results(const tables *t)
   plot_builders(t, path[1], performance, "diffuse rays/s, % of SweepSAH", 1);
   plot_effective(t, path[2]);
   plot_scenes(t, path[3]);
-  fputs("# The paper's tables, made again\n\nMade by [tables.c](tables.c). Performance is diffuse rays per second with one thread; the same "
-        "collapse into leaves, layout and traversal for all trees. \"Paper\" columns: Karras and Aila 2013, on a GPU, 20 scenes of "
-        "theirs.\n", out);
+  fputs("# The paper's tables, made again\n\nMade by [tables.c](tables.c). Performance is diffuse rays per second with one "
+        "thread; collapse into leaves, layout and traversal are the same for all trees. \"Paper\" columns: Karras and "
+        "Aila 2013, on a GPU, 20 scenes of theirs.\n", out);
   print_report(out, t, 1);
   fputs("\n## Diagrams\n", out);
   for (int i = 0; i < 4; i++) fprintf(out, "\n![%s](%s)\n", plots[i][1], plots[i][0]);
@@ -851,8 +868,8 @@ static void write_results(const tables *t)
 
 // >>main ----------------------------------------------------------------------------------------------------
 enum {
-  OPTION_SCENES, OPTION_BUILDERS, OPTION_THREADS, OPTION_REPS, OPTION_SIZE, OPTION_SAMPLES, OPTION_TRIANGLES, OPTION_CSV,
-  OPTION_OUT, OPTION_NOTES, OPTION_QUICK, OPTIONS
+  OPTION_SCENES, OPTION_BUILDERS, OPTION_THREADS, OPTION_REPS, OPTION_SIZE, OPTION_SAMPLES, OPTION_TRIANGLES,
+  OPTION_CSV, OPTION_OUT, OPTION_NOTES, OPTION_QUICK, OPTIONS
 };
 static const ex_option options_known[OPTIONS] = {
   {"--scenes", EX_VALUE}, {"--builders", EX_VALUE}, {"--threads", EX_VALUE}, {"--reps", EX_VALUE}, {"--size", EX_VALUE},
@@ -900,7 +917,8 @@ static void set_defaults(tables *t)
   if (!t->height) t->height = t->quick ? 36 : 96;
   if (!t->samples) t->samples = t->quick ? 2 : 8;
   if (!t->triangles) t->triangles = t->quick ? 6000 : 100000;
-  for (int kind = EX_TERRAIN; kind <= EX_SLIVERS && (kind || !t->inputs.count); kind++) ex_add_scene(&t->inputs, (ex_kind)kind);
+  int built_in = !t->inputs.count;
+  for (int kind = EX_TERRAIN; kind <= EX_SLIVERS && built_in; kind++) ex_add_scene(&t->inputs, (ex_kind)kind);
   t->turns = t->threads[1] > 1 ? 2 : 1;
 }
 int main(int argc, char **argv)
@@ -915,10 +933,11 @@ int main(int argc, char **argv)
   snprintf(help + used, sizeof help - used, "\n");
   ex_arguments(argc, argv, help, options_known, OPTIONS, set_option, &t);
   set_defaults(&t);
-  for (size_t i = 0; i < t.inputs.count; i++) t.progress.total += expected_ns(&t, ex_expected_triangles(&t.inputs.at[i], t.triangles));
+  for (size_t i = 0; i < t.inputs.count; i++) {
+    t.progress.total += expected_ns(&t, ex_expected_triangles(&t.inputs.at[i], t.triangles));
+  }
   t.scenes = (scene_results *)ex_allocate(t.inputs.count, sizeof *t.scenes);
   for (size_t i = 0; i < t.inputs.count; i++) measure_scene(&t, &t.inputs.at[i], &t.scenes[i]);
-  measure_treelets(&t);
   ex_clear_progress();
   print_report(stdout, &t, !t.quick);
   if (t.csv_path) write_csv(&t);
