@@ -1,15 +1,15 @@
-/* bittner.h - insertion-based optimization (Bittner, Hapala and Havran 2013, "Fast Insertion-Based Optimization of
- * Bounding Volume Hierarchies").
+/* bittner.h - insertion-based optimization (Bittner, Hapala and Havran 2013, "Fast Insertion-Based
+ * Optimization of Bounding Volume Hierarchies").
  *
- * The inner nodes that are worst by a measure of their inefficiency are dissolved, a batch at a time: such a node goes
- * with its parent, and its two children are inserted again, one after the other, each where it costs least in the whole
- * tree. That place is found by branch and bound.
+ * The inner nodes that are worst by a measure of their inefficiency are dissolved, a batch at a time: such a
+ * node goes with its parent, and its two children are inserted again, one after the other, each where it
+ * costs least in the whole tree. That place is found by branch and bound.
  *
- * In two things this differs from what we know of the article. Its batches are the worst 1 % of all nodes, and when
- * those do not help any more, nodes by chance; here they are the worst 1 % of the nodes that have not had a turn yet,
- * and all have had one before the next round: otherwise the same few, which no place is good for, come again and again.
- * And a node whose children have found no better places together goes back to where it was, so that the cost never
- * rises. The last round is one that gains less than 0.1 %.
+ * In two things this differs from what we remember of the article. Its batches are the worst 1 % of all
+ * nodes, and when those do not help any more, nodes by chance; here they are the worst 1 % of the nodes that
+ * have not had a turn yet, and all have had one before the next round: otherwise the same few, which no place
+ * is good for, come again and again. And a node whose children have found no better places together goes back
+ * to where it was, so that the cost never rises. The last round is one that gains less than 0.1 %.
  *
  * The paper's table: 103.3 % of SweepSAH's performance, 87.7 % of its SAH cost, 1083 % of its time.
  */
@@ -18,8 +18,8 @@
 #include "moves.h"
 
 enum { PAPER_BINS = 65536 };
-typedef struct paper_lead { float induced; uint32_t pair; } paper_lead;   /* insertion below costs as much above already */
-typedef struct paper_place { uint32_t slot; double cost; } paper_place;   /* a new node there, above what is there */
+typedef struct paper_lead { float induced; uint32_t pair; } paper_lead;   /* growth of the nodes above pair */
+typedef struct paper_place { uint32_t slot; double cost; } paper_place;   /* a new parent of what is there */
 typedef struct paper_inserter {
   paper_mover    m;
   paper_lead    *leads;                /* a heap, the cheapest first */
@@ -33,7 +33,9 @@ typedef struct paper_inserter {
 static inline void paper_add_lead(paper_inserter *s, paper_lead lead)
 {
   uint32_t at = s->lead_count++;
-  for (; at && lead.induced < s->leads[(at - 1) / 2].induced; at = (at - 1) / 2) s->leads[at] = s->leads[(at - 1) / 2];
+  for (; at && lead.induced < s->leads[(at - 1) / 2].induced; at = (at - 1) / 2) {
+    s->leads[at] = s->leads[(at - 1) / 2];
+  }
   s->leads[at] = lead;
 }
 static inline paper_lead paper_take_lead(paper_inserter *s)
@@ -48,8 +50,8 @@ static inline paper_lead paper_take_lead(paper_inserter *s)
   leads[at] = last;
   return cheapest;
 }
-/* Where it costs least to insert node: the new parent's area and what it adds to those above, which is known for a
- * whole subtree. Below it, no parent can be smaller than node itself. */
+/* Where it costs least to insert node: the new parent's area and what it adds to those above, which is
+ * known for a whole subtree. Below it, no parent can be smaller than node itself. */
 static inline paper_place paper_find_place(paper_inserter *s, const trbvh_node *node)
 {
   const trbvh_node *n = s->m.nodes;
@@ -64,7 +66,9 @@ static inline paper_place paper_find_place(paper_inserter *s, const trbvh_node *
       float here = trb_area(paper_union(n[i], node)), induced = lead.induced + (here - trb_area(n[i]));
       double cost = (double)lead.induced + here;
       if (cost < best.cost) best = (paper_place){i, cost};
-      if (!paper_is_leaf(&n[i]) && (double)induced + area < best.cost) paper_add_lead(s, (paper_lead){induced, n[i].first});
+      if (!paper_is_leaf(&n[i]) && (double)induced + area < best.cost) {
+        paper_add_lead(s, (paper_lead){induced, n[i].first});
+      }
     }
   }
   return best;
@@ -88,7 +92,8 @@ static inline void paper_take_out(paper_mover *m, uint32_t slot)
   paper_put(m, parent, m->nodes[slot ^ 1]);
   paper_refit_above(m, parent);
 }
-/* Inserts node at slot: what is there and node are the new children, in a pair that is free, node the right one. */
+/* Inserts node at slot: what is there and node are the new children, in a pair that is free, node the
+ * right one. */
 static inline void paper_insert(paper_mover *m, trbvh_node node, uint32_t pair, uint32_t slot)
 {
   paper_put(m, pair, m->nodes[slot]);
@@ -121,15 +126,17 @@ static inline void paper_reinsert(paper_inserter *s, uint32_t pair)
   m->cost = old_cost;
 }
 
-/* M = M_sum M_min M_area: area by the children's mean area, area by the smaller one's, area. With a little added where
- * children have no area: from there to what the largest areas give, M is far from the ends of double. */
+/* M = M_sum M_min M_area: area by the children's mean area, area by the smaller one's, area. With a little
+ * added where children have no area: from there to what the largest areas give, M is far from the ends of
+ * double. */
 static inline double paper_inefficiency(const paper_mover *m, uint32_t pair)
 {
   double area = trb_area(m->nodes[m->parent[pair / 2]]);
   double left = trb_area(m->nodes[pair]), right = trb_area(m->nodes[pair + 1]);
   return area / (0.5 * (left + right) + 1e-50) * (area / (TRB_MIN(left, right) + 1e-50)) * area;
 }
-/* Makes keys of the worst `count` nodes of those that wait, worst first, and perhaps of others behind them. */
+/* Makes keys of the worst `count` nodes of those that wait, worst first, and perhaps of others behind
+ * them. */
 static inline void paper_rank(paper_inserter *s, uint32_t count)
 {
   uint32_t all = 0, some = 0, sum = 0, bin = 0;
@@ -161,7 +168,7 @@ static inline void paper_reinsert_round(paper_inserter *s)
   uint32_t pairs = s->m.p->pair_end - 1;
   memset(s->had_turn, 0, s->m.p->pair_end);
   for (s->waiting = pairs; s->waiting;) paper_reinsert_batch(s, pairs / 100 + 1);
-  paper_link(&s->m);                   /* the cost without the roundings of so many changes */
+  paper_link(&s->m);                   /* no rounding of areas next to huge ones may look like a gain */
 }
 
 static inline paper_inserter paper_start_insertion(paper_build *p)

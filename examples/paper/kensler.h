@@ -1,16 +1,17 @@
 /* kensler.h - tree rotations (Kensler 2008, "Tree Rotations for Improving Bounding Volume Hierarchies").
  *
- * A rotation swaps two subtrees below a node: a child and a child of its sibling, or grandchildren that are cousins. It
- * changes the areas of the node's children alone. Both of the article's algorithms are here: hill climbing, and
- * simulated annealing, which gets out of some local minima. Which one the paper's table has, and from what tree, is not
- * known to us; it says 91.5 % of SweepSAH's performance, 99.6 % of its SAH cost, 552 % of its time.
+ * A rotation swaps two subtrees below a node: a child and a child of its sibling, or grandchildren that are
+ * cousins. It changes the areas of the node's children alone. Both of the article's algorithms are here: hill
+ * climbing, and simulated annealing, which gets out of some local minima. Which one the paper's table has,
+ * and from what tree, is not known to us; it says 91.5 % of SweepSAH's performance, 99.6 % of its SAH cost,
+ * 552 % of its time.
  */
 #ifndef PAPER_KENSLER_H
 #define PAPER_KENSLER_H
 #include "moves.h"
 
 enum { PAPER_ROTATIONS = 6 };
-typedef struct paper_rotation { uint32_t a, b; double gain; } paper_rotation;   /* what it swaps; a = 0: nothing */
+typedef struct paper_rotation { uint32_t a, b; double gain; } paper_rotation;   /* a = 0: none */
 
 /* One of the six rotations below the inner node at slot. */
 static inline paper_rotation paper_rotation_below(const paper_mover *m, uint32_t slot, uint32_t which)
@@ -24,12 +25,13 @@ static inline paper_rotation paper_rotation_below(const paper_mover *m, uint32_t
     r.a = child;
     r.b = n[sibling].first + which % 2;
     r.gain = (double)trb_area(n[sibling]) - trb_area(paper_union(n[child], &n[r.b ^ 1]));
-  } else {                             /* one of left's children and one of right's; the other two pairs do the same */
+  } else {                             /* a child of left's and one of right's; the other pairs do the same */
     if (paper_is_leaf(&n[left]) || paper_is_leaf(&n[right])) return r;
     r.a = n[left].first;
     r.b = n[right].first + which % 2;
     double old_areas = (double)trb_area(n[left]) + trb_area(n[right]);
-    r.gain = old_areas - trb_area(paper_union(n[r.a], &n[r.b ^ 1])) - trb_area(paper_union(n[r.b], &n[r.a ^ 1]));
+    r.gain = old_areas - trb_area(paper_union(n[r.a], &n[r.b ^ 1]))
+           - trb_area(paper_union(n[r.b], &n[r.a ^ 1]));
   }
   return r;
 }
@@ -44,8 +46,9 @@ static inline void paper_rotate(paper_mover *m, uint32_t slot, paper_rotation r)
   m->cost -= r.gain;
 }
 
-/* Bottom-up over all nodes, at each the best rotation, again and again until none helps. A gain must be more than a
- * hundred-thousandth of the node's area, which is above all rounding: no sum of areas comes twice, so this ends. */
+/* Bottom-up over all nodes, at each the best rotation, again and again until none helps. A gain must be
+ * more than a hundred-thousandth of the node's area, which is above all rounding: no sum of areas comes
+ * twice, so this ends. */
 static inline void paper_climb(paper_mover *m)
 {
   for (int better = 1; better;) {
@@ -71,8 +74,8 @@ static inline void paper_kensler_climb(paper_build *p)
   paper_end_moves(&m);
 }
 
-/* Bottom-up over all nodes, at each a rotation by chance: taken if it helps, otherwise with probability exp(-dC / T).
- * dC is the rise of the node's own SAH cost, so relative to its area. */
+/* Bottom-up over all nodes, at each a rotation by chance: taken if it helps, otherwise with probability
+ * exp(-dC / T). dC is the rise of the node's own SAH cost, so relative to its area. */
 static inline void paper_anneal_sweep(paper_mover *m, double temperature, uint32_t *seed)
 {
   uint32_t slot = 0;
@@ -82,12 +85,14 @@ static inline void paper_anneal_sweep(paper_mover *m, double temperature, uint32
     paper_rotation r = paper_rotation_below(m, slot, which);
     double scale = temperature * trb_area(m->nodes[slot]);
     if (!r.a) continue;
-    if (r.gain >= 0 || (r.gain > -20 * scale && ex_random(seed) < exp(r.gain / scale))) paper_rotate(m, slot, r);
+    if (r.gain >= 0 || (r.gain > -20 * scale && ex_random(seed) < exp(r.gain / scale))) {
+      paper_rotate(m, slot, r);
+    }
   } while (slot);
 }
-/* The schedule is ours, not the article's, which we do not have: hill climbing; 200 sweeps while T falls from 0.05 to
- * 0.003 by the same factor each; hill climbing again. The better one of both hills is kept: T is so low in the end that
- * the last tree is also the best since. */
+/* The schedule is ours, not the article's, which we do not have: hill climbing; 200 sweeps while T falls
+ * from 0.05 to 0.003 by the same factor each; hill climbing again. The better one of both hills is kept: T
+ * is so low in the end that the last tree is also the best since. */
 static inline void paper_kensler_anneal(paper_build *p)
 {
   paper_mover m = paper_start_moves(p);
@@ -97,7 +102,7 @@ static inline void paper_kensler_anneal(paper_build *p)
   paper_climb(&m);
   memcpy(climbed, p->nodes, size);
   double climbed_cost = m.cost;
-  for (double temperature = 0.05; temperature > 0.003; temperature *= 0.986) paper_anneal_sweep(&m, temperature, &seed);
+  for (double t = 0.05; t > 0.003; t *= 0.986) paper_anneal_sweep(&m, t, &seed);
   paper_climb(&m);
   if (m.cost > climbed_cost) {
     memcpy(p->nodes, climbed, size);

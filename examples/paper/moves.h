@@ -1,8 +1,8 @@
 /* moves.h - what builders that improve another one's tree share, by moving its subtrees.
  *
- * A subtree moves by a copy of its topmost node to another slot; all that is below stays where it is. Pairs are soon in
- * no order, so the way through the tree is by links to the parents. What stays the same of an inner node wherever it
- * moves is its children's place: nodes are named by that where slots may change.
+ * A subtree moves by a copy of its topmost node to another slot; all that is below stays where it is. Pairs
+ * are soon in no order, so the way through the tree is by links to the parents. What stays the same of an
+ * inner node wherever it moves is its children's place: nodes are named by that where slots may change.
  */
 #ifndef PAPER_MOVES_H
 #define PAPER_MOVES_H
@@ -14,8 +14,8 @@ typedef struct paper_moves_settings {
 
 typedef struct paper_mover {
   paper_build *p;
-  trbvh_node  *nodes;                  /* p's; boxes are right at all times, counts of inner nodes only at the end */
-  uint32_t    *parent;                 /* by pair (half the index of its left node): where the node above it is */
+  trbvh_node  *nodes;                  /* p's; boxes are right at all times, inner counts only at the end */
+  uint32_t    *parent;                 /* by pair (half its left node's index): where the node above it is */
   double       cost;                   /* the inner nodes' areas: what moves can change of the SAH cost */
 } paper_mover;
 
