@@ -14,9 +14,9 @@
 #define PAPER_GRID_H
 #include "hlbvh.h"
 
-/* How fine the grids are is not known. With 8 cells along an axis, trees are as good as HLBVH's, as they are
- * in the paper's table; with 32, SAH is 5 % lower and builds take up to twice as long; with 4, it is 4 %
- * higher (13 meshes). */
+/* How fine the published grids are we do not know. With 8 cells along an axis, trees are as good as HLBVH's,
+ * as in the paper's table; with 32, SAH is 5 % lower in about the same time; with 4, it is 4 % higher (13
+ * meshes). */
 enum { PAPER_GRID_BITS = 3 };
 
 /* The references of a cell that waits for its grid. */

@@ -29,32 +29,36 @@ typedef struct paper_plane { double cost, balance; int axis; uint32_t bin; } pap
 static inline void paper_plane_of_axis(const paper_cell *cells, uint32_t count, int axis, paper_plane *best)
 {
   paper_bin bins[PAPER_BINS];
-  uint32_t low = PAPER_BINS, high = 0, all = 0, left = 0;
+  uint32_t low = PAPER_BINS, high = 0, right = 0;
   for (uint32_t i = 0; i < count; i++) {
     low = TRB_MIN(cells[i].bin[axis], low);
     high = TRB_MAX(cells[i].bin[axis], high);
   }
-  for (uint32_t i = low; i <= high; i++) bins[i] = (paper_bin){trb_no_box(), 0, 0};
+  for (uint32_t i = low; i <= high; i++) bins[i].count = 0;
   for (uint32_t i = 0; i < count; i++) {
     paper_bin *bin = &bins[cells[i].bin[axis]];
-    bin->box = paper_union(bin->box, &cells[i].node);
+    bin->box = bin->count ? paper_union(bin->box, &cells[i].node) : cells[i].node;
     bin->count += cells[i].count;
-    all += cells[i].count;
   }
   trbvh_node box = trb_no_box();
   for (uint32_t i = high; i > low; i--) {
+    if (bins[i].count == 0) continue;
     box = paper_union(box, &bins[i].box);
     bins[i].right_area = trb_area(box);
+    right += bins[i].count;
   }
-  box = trb_no_box();
+  box = bins[low].box;
+  uint32_t left = bins[low].count;
   for (uint32_t i = low + 1; i <= high; i++) {
-    box = paper_union(box, &bins[i - 1].box);
-    left += bins[i - 1].count;
-    double nl = left, nr = all - left, balance = nl * nl + nr * nr;
+    if (bins[i].count == 0) continue;  /* the next plane parts nothing else */
+    double nl = left, nr = right, balance = nl * nl + nr * nr;
     double cost = trb_area(box) * nl + bins[i].right_area * nr;
     if (cost < best->cost || (cost == best->cost && balance < best->balance)) {
       *best = (paper_plane){cost, balance, axis, i};
     }
+    box = paper_union(box, &bins[i].box);
+    left += bins[i].count;
+    right -= bins[i].count;
   }
 }
 /* Parts the cells, in their order on either side, and returns how many are on the left. */

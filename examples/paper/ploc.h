@@ -8,7 +8,7 @@
  *
  * Nearest of all with equal areas is the one whose place differs least, by exclusive or. That orders pairs
  * the same way for both of their clusters, and no two pairs with one in common tie: so the least pair of all
- * is mutual, and each round merges something. And equal boxes merge two by two; were the first in reach nearest,
+ * is mutual, and each round merges something. And equal boxes merge two by two; were the first nearest,
  * only one pair of them would be each other's. Rounds may still be many, where boxes keep growing along the
  * curve.
  */
@@ -17,7 +17,7 @@
 #include "paper.h"
 
 enum { PAPER_PLOC_RADIUS = 16 };       /* with HIPRT's 8, SAH is 1 % higher (13 meshes) */
-typedef struct paper_ploc_settings { uint32_t radius; } paper_ploc_settings;
+typedef struct paper_ploc_settings { uint32_t radius; } paper_ploc_settings;   /* 1 or more */
 
 /* nearest: the area of the union, 32 bits, then i ^ j. Each pair is looked at once, for both of its
  * clusters. */
