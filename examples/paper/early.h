@@ -1,16 +1,18 @@
-/* early.h - triangles split before the build, by ESC and EVH, and then trbvh's linear BVH over the pieces; run treelet
- * rounds on it.
+/* early.h - triangles split before the build, by ESC and EVH, and then trbvh's linear BVH over the pieces;
+ * run treelet rounds on it.
  *
- *   paper_esc   Early Split Clipping (Ernst and Greiner 2007, "Early Split Clipping for Bounding Volume Hierarchies"):
- *               boxes with an area above a threshold are halved at the middle of their longest side, and shrunk to what
- *               of the triangle is in each half.
- *   paper_evh   The Edge Volume Heuristic (Dammertz and Keller 2008, "The Edge Volume Heuristic - Robust Triangle
- *               Subdivision for Improved BVH Performance"): the triangle is halved at the middle of the edge whose box has
- *               the largest volume, while that is above a threshold. An edge that two triangles share is cut alike in both.
+ *   paper_esc   Early Split Clipping (Ernst and Greiner 2007, "Early Split Clipping for Bounding Volume
+ *               Hierarchies"): boxes with an area above a threshold are halved at the middle of their
+ *               longest side, and shrunk to what of the triangle is in each half.
+ *   paper_evh   The Edge Volume Heuristic (Dammertz and Keller 2008, "The Edge Volume Heuristic - Robust
+ *               Triangle Subdivision for Improved BVH Performance"): the triangle is halved at the middle
+ *               of the edge whose box has the largest volume, while that is above a threshold. An edge
+ *               that two triangles share is cut alike in both.
  *
- * Both leave the threshold to the user. Here the number of references is given, as the paper's "match SBVH" rows need it
- * (parameters: a uint32_t; NULL or 0: ref_max), and the least threshold that makes no more is found by bisection. Each
- * step only counts pieces; they are made when they are not too many, and later steps go on from them.
+ * Both leave the threshold to the user. Here the number of references is given, as the paper's "match
+ * SBVH" rows need it (parameters: a uint32_t; NULL or 0: ref_max), and the least threshold that makes no
+ * more is found by bisection. Each step only counts pieces; they are made when they are not too many, and
+ * later steps go on from them.
  */
 #ifndef PAPER_EARLY_H
 #define PAPER_EARLY_H
@@ -25,7 +27,7 @@ typedef struct paper_piece {
 } paper_piece;
 typedef struct paper_heuristic {
   double     (*size)(const paper_piece *piece);      /* 0: cannot be halved */
-  int        (*halve)(const paper_piece *piece, paper_piece halves[2]);   /* 1, or 2 where both are not empty */
+  int        (*halve)(const paper_piece *piece, paper_piece halves[2]);   /* 1 where one is empty, or 2 */
   trbvh_node (*box)(const paper_piece *piece, const float triangle[3][3]);
 } paper_heuristic;
 
@@ -50,7 +52,8 @@ static inline void paper_keep_piece(paper_pieces *s, uint32_t i, const paper_pie
   s->pieces[i] = *piece;
   s->sizes[i] = piece->size;
 }
-/* How many pieces a threshold makes, or some number above the most that are allowed; with `make`, makes them. */
+/* How many pieces a threshold makes, or some number above the most that are allowed; with `make`, makes
+ * them. */
 static inline uint32_t paper_cut_pieces(paper_pieces *s, uint32_t threshold, int make)
 {
   paper_piece stack[PAPER_PIECE_DEPTH + 2], halves[2];
@@ -83,7 +86,7 @@ static inline uint32_t paper_find_threshold(paper_pieces *s)
 {
   uint32_t low = 0, high = 0;
   for (uint32_t i = 0; i < s->count; i++) high = TRB_MAX(s->sizes[i], high);
-  while (low < high) {                 /* down by a factor of four at most, where nearly all pieces will be used */
+  while (low < high) {                 /* by a factor of four at most: then few pieces are counted in vain */
     uint32_t half = (high - low + 1) / 2, middle = high - TRB_MIN(half, 1u << 21);
     if (paper_cut_pieces(s, middle, 0) > s->most) {
       low = middle + 1;
@@ -99,7 +102,7 @@ static inline uint32_t paper_split_early(paper_build *p, const paper_heuristic *
   uint32_t wanted = p->parameters ? *(const uint32_t *)p->parameters : 0, vertex;
   float v[3][3];
   paper_pieces s = {heuristic, NULL, NULL, p->ref_count, wanted && wanted < p->ref_max ? wanted : p->ref_max};
-  if (s.most <= p->ref_count) return UINT32_MAX;     /* no splits: boxes, which are no triangles, among others */
+  if (s.most <= p->ref_count) return UINT32_MAX;     /* always so for boxes: they are no triangles */
   s.pieces = (paper_piece *)ex_allocate(s.most, sizeof *s.pieces);
   s.sizes = (uint32_t *)ex_allocate(s.most, sizeof *s.sizes);
   for (uint32_t i = 0; i < s.count; i++) {
@@ -174,7 +177,7 @@ static inline double paper_edge_volume(const float a[3], const float b[3])
   }
   return longest > TRB_TINY ? volume : 0;
 }
-static inline int paper_largest_edge(const float v[3][3], double *volume)   /* from corner i to the next one */
+static inline int paper_largest_edge(const float v[3][3], double *volume)   /* its first corner */
 {
   int largest = 0;
   *volume = paper_edge_volume(v[0], v[1]);
@@ -187,7 +190,7 @@ static inline int paper_largest_edge(const float v[3][3], double *volume)   /* f
   }
   return largest;
 }
-static inline void paper_edge_middle(const float a[3], const float b[3], float middle[3])   /* and of b, a the same */
+static inline void paper_edge_middle(const float a[3], const float b[3], float middle[3])   /* or of b, a */
 {
   for (int k = 0; k < 3; k++) middle[k] = 0.5f * a[k] + 0.5f * b[k];
 }
@@ -197,7 +200,8 @@ static inline double paper_evh_size(const paper_piece *piece)
   float middle[3];
   int from = paper_largest_edge(piece->v, &volume), to = (from + 1) % 3;
   paper_edge_middle(piece->v[from], piece->v[to], middle);
-  return memcmp(middle, piece->v[from], sizeof middle) && memcmp(middle, piece->v[to], sizeof middle) ? volume : 0;
+  int between = memcmp(middle, piece->v[from], sizeof middle) && memcmp(middle, piece->v[to], sizeof middle);
+  return between ? volume : 0;
 }
 static inline int paper_evh_halve(const paper_piece *piece, paper_piece halves[2])
 {
@@ -210,8 +214,8 @@ static inline int paper_evh_halve(const paper_piece *piece, paper_piece halves[2
   memcpy(halves[1].v[from], middle, sizeof middle);
   return 2;
 }
-/* Corners in the middle of edges are rounded. So that no ray slips between two pieces, boxes are padded as trb_clip does,
- * and cut off at the box of the whole triangle. */
+/* Corners in the middle of edges are rounded. So that no ray slips between two pieces, boxes are padded as
+ * trb_clip does, and cut off at the box of the whole triangle. */
 static inline trbvh_node paper_evh_box(const paper_piece *piece, const float triangle[3][3])
 {
   trbvh_node box, whole;

@@ -1,22 +1,24 @@
-/* sbvh.h - SBVH: spatial splits (Stich, Friedrich and Dietrich 2009, "Spatial Splits in Bounding Volume Hierarchies"),
- * the best trees of the paper's second table, which is relative to them.
+/* sbvh.h - SBVH: spatial splits (Stich, Friedrich and Dietrich 2009, "Spatial Splits in Bounding Volume
+ * Hierarchies"), the best trees of the paper's second table, which is relative to them.
  *
- * At each node the full sweep finds the best object split. Where its two boxes overlap by alpha of the scene's area or
- * more, planes between bins along the three axes are tried as well (section 4.3): triangles are chopped into the bins,
- * and those on both sides of the best plane become two references each, or stay whole on one side where that is
- * cheaper (section 4.4, reference unsplitting). Parameters and the order of unsplitting are those of the authors' later
- * public implementation: alpha 1e-5, 128 bins, no spatial split below depth 48.
+ * At each node the full sweep finds the best object split. Where its two boxes overlap by alpha of the
+ * scene's area or more, planes between bins along the three axes are tried as well:
+ * triangles are chopped into the bins, and those on both sides of the best plane become two references
+ * each, or stay whole on one side where that is cheaper (reference unsplitting). Parameters
+ * and the order of unsplitting are those of the authors' public implementation: alpha 1e-5, 128 bins, no
+ * spatial split below depth 48.
  *
- * Theirs has no limit of references; here there is room for ref_max. So that depth-first order starves no part of the
- * scene, a node has a budget of its own: its children share what its split has left of it in proportion to their
- * references, and what a subtree has left over goes to the next one. Planes that cut more than the budget are not taken.
+ * Theirs has no limit of references; here there is room for ref_max. So that depth-first order starves no
+ * part of the scene, a node has a budget of its own: its children share what its split has left of it in
+ * proportion to their references, and what a subtree has left over goes to the next one. Planes that cut
+ * more than the budget are not taken.
  */
 #ifndef PAPER_SBVH_H
 #define PAPER_SBVH_H
 #include "sweep.h"
 
 enum {
-  PAPER_BINS = 128, PAPER_STRIDE = 8, PAPER_FEW = 256, PAPER_SPATIAL_DEPTH = 48,
+  PAPER_BINS = 128, PAPER_STRIDE = 8, PAPER_SPATIAL_DEPTH = 48,
   PAPER_LEFT = 1, PAPER_RIGHT = 2, PAPER_BOTH = 3
 };
 typedef struct paper_sbvh_settings {
@@ -45,7 +47,7 @@ typedef struct paper_splitter {
 } paper_splitter;
 
 typedef struct paper_plane { double cost; int axis; float position; } paper_plane;
-typedef struct paper_sides { uint32_t left, right, cut; } paper_sides;   /* references on each side, those on both */
+typedef struct paper_sides { uint32_t left, right, cut; } paper_sides;   /* references; cut: on both sides */
 typedef struct paper_task { uint32_t slot, begin, end, budget; int depth; } paper_task;
 
 // ---- bins ----
@@ -171,8 +173,9 @@ static inline void paper_sweep_bins(paper_bins *b, const paper_task *t, paper_pl
   paper_sum_bins(b);
   for (int i = 1; i < b->count; i++) {
     const trbvh_node *left = &b->left[i], *right = &b->right[i];
-    if (b->plane[i] <= b->plane[0] || b->plane[i] >= b->plane[b->count]) continue;   /* rounded: not between them */
-    if (left->count == 0 || right->count == 0 || left->count + right->count - (t->end - t->begin) > t->budget) continue;
+    uint32_t count = left->count + right->count;
+    if (b->plane[i] <= b->plane[0] || b->plane[i] >= b->plane[b->count]) continue;   /* by rounding */
+    if (left->count == 0 || right->count == 0 || count - (t->end - t->begin) > t->budget) continue;
     double cost = paper_cost_of(left, right);
     if (cost < best->cost) *best = (paper_plane){cost, b->axis, b->plane[i]};
   }
@@ -201,12 +204,14 @@ static inline void paper_refine(paper_splitter *s, const paper_task *t, const pa
   }
   paper_sweep_bins(b, t, best);
 }
-/* The best plane that is better than `bound`. Few references reach through many bins each: they are put into eight times
- * wider ones first, and what is left and right of these tells where the planes between them need not be looked at. */
-static inline paper_plane paper_best_plane(paper_splitter *s, const paper_task *t, const trbvh_node *box, double bound)
+/* The best plane that is better than `bound`. Most references of small nodes reach through many bins. So
+ * they are put into eight times wider ones first, and what is left and right of one of these tells whether
+ * a plane within it can be better: nearly always, none can. */
+static inline paper_plane paper_best_plane(paper_splitter *s, const paper_task *t, const trbvh_node *box,
+                                           double bound)
 {
   paper_plane best = {bound, 0, 0};
-  int few = t->end - t->begin < PAPER_FEW, count = s->settings.bins / (few ? PAPER_STRIDE : 1), axes = 0;
+  int count = s->settings.bins / PAPER_STRIDE, axes = 0;
   for (int k = 0; k < 3; k++) {
     float size = box->max[k] - box->min[k];
     if (!(size > TRB_TINY && trb_longest_side(*box) < 1 / TRB_TINY)) continue;
@@ -219,7 +224,7 @@ static inline paper_plane paper_best_plane(paper_splitter *s, const paper_task *
     for (int a = 0; a < axes; a++) paper_add_to_bins(s->p, &s->axes[a], ref, polygon, &corners);
   }
   for (int a = 0; a < axes; a++) paper_sweep_bins(&s->axes[a], t, &best);
-  for (int a = 0; a < axes && few; a++) {
+  for (int a = 0; a < axes; a++) {
     for (int i = 0; i < count; i++) {
       const paper_bins *b = &s->axes[a];
       if (paper_cost_of(&b->left[i], &b->right[i + 1]) < best.cost) paper_refine(s, t, b, i, &best);
@@ -315,10 +320,10 @@ static inline void paper_sort_keys(uint64_t *keys, uint32_t count)
     keys[k] = key;
   }
 }
-/* Both sides in the order of their centres, from at[0] and at[1] on: what has not changed still is in order, and the
- * halves, the left ones from cut[], the right ones from first_new on, are merged in. */
-static inline void paper_divide(paper_splitter *s, const paper_task *t, const paper_sides *n, uint32_t first_new,
-                                const uint32_t at[2])
+/* Both sides in the order of their centres, from at[0] and at[1] on: what has not changed still is in
+ * order, and the halves, the left ones from cut[], the right ones from first_new on, are merged in. */
+static inline void paper_divide(paper_splitter *s, const paper_task *t, const paper_sides *n,
+                                uint32_t first_new, const uint32_t at[2])
 {
   for (int axis = 0; axis < 3; axis++) {
     uint32_t *order = s->sweep.order[axis], *out[2], next[2] = {0, 0};
@@ -364,8 +369,9 @@ static inline float paper_overlap(const trbvh_node *a, const trbvh_node *b)
   }
   return trb_area(both);
 }
-/* A spatial split where there is a better one than the object split; else no references on either side. Where a leaf is
- * better than both, the authors' builder ends. Here it goes on, for the collapse to decide, but splits no more. */
+/* A spatial split where there is a better one than the object split; else no references on either side.
+ * Where a leaf is better than both, the authors' builder ends. Here it goes on, for the collapse to
+ * decide, but splits no more. */
 static inline paper_sides paper_try_spatial(paper_splitter *s, paper_task *t, const paper_cut *cut)
 {
   const paper_sides none = {0, 0, 0};
@@ -373,9 +379,10 @@ static inline paper_sides paper_try_spatial(paper_splitter *s, paper_task *t, co
   uint32_t count = t->end - t->begin;
   if (t->budget == 0 || t->depth >= PAPER_SPATIAL_DEPTH) return none;
   trbvh_node left = paper_box_of(s, cut->axis, t->begin, t->begin + cut->left);
-  trbvh_node right = paper_box_of(s, cut->axis, t->begin + cut->left, t->end), box = paper_union(left, &right);
+  trbvh_node right = paper_box_of(s, cut->axis, t->begin + cut->left, t->end);
+  trbvh_node box = paper_union(left, &right);
   if (paper_overlap(&left, &right) < s->least_overlap) return none;
-  double area = trb_area(box), leaf = area * count - area / costs.ratio;   /* a split that costs less is better */
+  double area = trb_area(box), leaf = area * count - area / costs.ratio;   /* worth a split that costs less */
   int may_end = count <= costs.max_leaf && leaf <= cut->cost;
   double bound = may_end ? leaf : cut->cost;
   paper_plane plane = paper_best_plane(s, t, &box, bound);
@@ -398,8 +405,10 @@ static inline paper_sides paper_split_node(paper_splitter *s, paper_task *t)
 }
 static inline void paper_sbvh_build(paper_splitter *s)
 {
-  /* The smaller side is first: each entry has half of the one below it at most, or is one of the spatial splits. */
-  paper_task stack[32 + PAPER_SPATIAL_DEPTH], now = {0, 0, s->p->ref_count, s->p->ref_max - s->p->ref_count, 0};
+  /* The smaller side is first: each entry has half of the one below it at most, or is one of the spatial
+   * splits. */
+  paper_task stack[32 + PAPER_SPATIAL_DEPTH];
+  paper_task now = {0, 0, s->p->ref_count, s->p->ref_max - s->p->ref_count, 0};
   uint32_t waiting = 0;
   for (;;) {
     if (now.end - now.begin == 1) {
@@ -412,9 +421,10 @@ static inline void paper_sbvh_build(paper_splitter *s)
     }
     uint32_t first_new = s->p->ref_count, first = paper_new_pair(s->p);
     paper_sides n = paper_split_node(s, &now);
-    uint32_t left_waits = n.left > n.right, waits = left_waits ? n.left : n.right, goes_on = n.left + n.right - waits;
-    uint32_t budget = now.budget - n.cut, share = (uint32_t)((uint64_t)budget * waits / (waits + goes_on));
-    uint32_t at[2] = {left_waits ? 0 : waits, left_waits ? waits : 0};   /* what goes on has room to grow behind it */
+    uint32_t left_waits = n.left > n.right, waits = left_waits ? n.left : n.right;
+    uint32_t goes_on = n.left + n.right - waits, budget = now.budget - n.cut;
+    uint32_t share = (uint32_t)((uint64_t)budget * waits / (waits + goes_on));
+    uint32_t at[2] = {left_waits ? 0 : waits, left_waits ? waits : 0};   /* what goes on can grow behind it */
     paper_divide(s, &now, &n, first_new, at);
     paper_set_inner(s->p, now.slot, first);
     stack[waiting++] = (paper_task){first + !left_waits, now.begin, now.begin + waits, share, now.depth + 1};
