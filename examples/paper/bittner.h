@@ -17,7 +17,7 @@
 #define PAPER_BITTNER_H
 #include "moves.h"
 
-enum { PAPER_BINS = 65536 };
+enum { PAPER_MEASURE_BINS = 65536 };
 typedef struct paper_lead { float induced; uint32_t pair; } paper_lead;   /* growth of the nodes above pair */
 typedef struct paper_place { uint32_t slot; double cost; } paper_place;   /* a new parent of what is there */
 typedef struct paper_inserter {
@@ -140,7 +140,7 @@ static inline double paper_inefficiency(const paper_mover *m, uint32_t pair)
 static inline void paper_rank(paper_inserter *s, uint32_t count)
 {
   uint32_t all = 0, some = 0, sum = 0, bin = 0;
-  memset(s->bins, 0, PAPER_BINS * sizeof *s->bins);
+  memset(s->bins, 0, PAPER_MEASURE_BINS * sizeof *s->bins);
   for (uint32_t i = 1; i < s->m.p->pair_end; i++) {
     double measure = paper_inefficiency(&s->m, 2 * i);
     uint64_t bits;
@@ -178,7 +178,7 @@ static inline paper_inserter paper_start_insertion(paper_build *p)
   s.m = paper_start_moves(p);
   s.leads = (paper_lead *)ex_allocate(p->pair_end, sizeof *s.leads);
   s.keys = (uint64_t *)ex_allocate(p->pair_end, sizeof *s.keys);
-  s.bins = (uint32_t *)ex_allocate(PAPER_BINS, sizeof *s.bins);
+  s.bins = (uint32_t *)ex_allocate(PAPER_MEASURE_BINS, sizeof *s.bins);
   s.had_turn = (unsigned char *)ex_allocate(p->pair_end, 1);
   return s;
 }

@@ -14,7 +14,7 @@
 #define PAPER_HLBVH_H
 #include "paper.h"
 
-enum { PAPER_CLUSTER_BITS = 15, PAPER_BINS = 32 };   /* hippie's, by the author of PLOC, for HLBVH */
+enum { PAPER_CLUSTER_BITS = 15, PAPER_SAH_BINS = 32 };   /* hippie's, by the author of PLOC, for HLBVH */
 
 /* What the tree at the top is built over: a cluster or (grid.h) a cell. */
 typedef struct paper_cell {
@@ -24,12 +24,12 @@ typedef struct paper_cell {
   unsigned char bin[3];
 } paper_cell;
 typedef struct paper_bin { trbvh_node box; uint32_t count; float right_area; } paper_bin;   /* from here on */
-typedef struct paper_plane { double cost, balance; int axis; uint32_t bin; } paper_plane;   /* left of bin */
+typedef struct paper_bin_plane { double cost, balance; int axis; uint32_t bin; } paper_bin_plane;   /* left of bin */
 
-static inline void paper_plane_of_axis(const paper_cell *cells, uint32_t count, int axis, paper_plane *best)
+static inline void paper_bin_plane_of_axis(const paper_cell *cells, uint32_t count, int axis, paper_bin_plane *best)
 {
-  paper_bin bins[PAPER_BINS];
-  uint32_t low = PAPER_BINS, high = 0, right = 0;
+  paper_bin bins[PAPER_SAH_BINS];
+  uint32_t low = PAPER_SAH_BINS, high = 0, right = 0;
   for (uint32_t i = 0; i < count; i++) {
     low = TRB_MIN(cells[i].bin[axis], low);
     high = TRB_MAX(cells[i].bin[axis], high);
@@ -54,7 +54,7 @@ static inline void paper_plane_of_axis(const paper_cell *cells, uint32_t count, 
     double nl = left, nr = right, balance = nl * nl + nr * nr;
     double cost = trb_area(box) * nl + bins[i].right_area * nr;
     if (cost < best->cost || (cost == best->cost && balance < best->balance)) {
-      *best = (paper_plane){cost, balance, axis, i};
+      *best = (paper_bin_plane){cost, balance, axis, i};
     }
     box = paper_union(box, &bins[i].box);
     left += bins[i].count;
@@ -64,9 +64,9 @@ static inline void paper_plane_of_axis(const paper_cell *cells, uint32_t count, 
 /* Parts the cells, in their order on either side, and returns how many are on the left. */
 static inline uint32_t paper_part_cells(paper_cell *cells, uint32_t count, paper_cell *spare)
 {
-  paper_plane best = {DBL_MAX, DBL_MAX, -1, 0};
+  paper_bin_plane best = {DBL_MAX, DBL_MAX, -1, 0};
   uint32_t left = 0, right = 0;
-  for (int axis = 0; axis < 3 && count > 2; axis++) paper_plane_of_axis(cells, count, axis, &best);
+  for (int axis = 0; axis < 3 && count > 2; axis++) paper_bin_plane_of_axis(cells, count, axis, &best);
   if (best.axis < 0) return count / 2;
   for (uint32_t i = 0; i < count; i++) {
     if (cells[i].bin[best.axis] >= best.bin) spare[right++] = cells[i];
@@ -112,13 +112,13 @@ static inline float paper_center(const trbvh_node *box, int axis)
 static inline void paper_bin_centers(paper_cell *cells, uint32_t count)
 {
   for (int axis = 0; axis < 3; axis++) {
-    float low = FLT_MAX, high = -FLT_MAX, last = PAPER_BINS - 1;
+    float low = FLT_MAX, high = -FLT_MAX, last = PAPER_SAH_BINS - 1;
     for (uint32_t i = 0; i < count; i++) {
       float center = paper_center(&cells[i].node, axis);
       low = TRB_MIN(center, low);
       high = TRB_MAX(center, high);
     }
-    float bins_per_unit = PAPER_BINS / (high - low);
+    float bins_per_unit = PAPER_SAH_BINS / (high - low);
     for (uint32_t i = 0; i < count; i++) {
       float bin = (paper_center(&cells[i].node, axis) - low) * bins_per_unit;
       cells[i].bin[axis] = (unsigned char)TRB_MIN(bin, last);   /* NaN, where extents vanish, too */

@@ -49,7 +49,7 @@ static inline void paper_rotate(paper_mover *m, uint32_t slot, paper_rotation r)
 /* Bottom-up over all nodes, at each the best rotation, again and again until none helps. A gain must be
  * more than a hundred-thousandth of the node's area, which is above all rounding: no sum of areas comes
  * twice, so this ends. */
-static inline void paper_climb(paper_mover *m)
+static inline void paper_climb_hill(paper_mover *m)
 {
   for (int better = 1; better;) {
     uint32_t slot = 0;
@@ -70,7 +70,7 @@ static inline void paper_climb(paper_mover *m)
 static inline void paper_kensler_climb(paper_build *p)
 {
   paper_mover m = paper_start_moves(p);
-  paper_climb(&m);
+  paper_climb_hill(&m);
   paper_end_moves(&m);
 }
 
@@ -99,11 +99,11 @@ static inline void paper_kensler_anneal(paper_build *p)
   size_t size = 2 * (size_t)p->pair_end * sizeof *p->nodes;
   trbvh_node *climbed = (trbvh_node *)ex_allocate(size, 1);
   uint32_t seed = 1;
-  paper_climb(&m);
+  paper_climb_hill(&m);
   memcpy(climbed, p->nodes, size);
   double climbed_cost = m.cost;
   for (double t = 0.05; t > 0.003; t *= 0.986) paper_anneal_sweep(&m, t, &seed);
-  paper_climb(&m);
+  paper_climb_hill(&m);
   if (m.cost > climbed_cost) {
     memcpy(p->nodes, climbed, size);
     paper_link(&m);

@@ -1,12 +1,12 @@
 /* paper.h - what the builders in this folder share.
  *
  * Each of them is one function, in a file of its own, that makes a binary tree in the form in which trbvh.h builds: it
- * gets references, one box for each triangle, and leaves nodes. Everything before and after that is trbvh's own: reading
- * the mesh, the collapse into leaves, the layout, the triangles. So trees differ by their topology alone, and
+ * gets references, one box for each triangle, and leaves nodes. Everything before and after that is trbvh's own:
+ * reading the mesh, the collapse into leaves, the layout, the triangles. So trees differ by their topology alone, and
  * trbvh_validate, trbvh_sah and the queries judge them all alike.
  *
- * Include it after trbvh.h's implementation: it uses functions that are the library's own business, which a program that
- * is not shipped with it should not.
+ * Include it after trbvh.h's implementation: it uses functions that are the library's own business, which a program
+ * that is not shipped with it should not.
  */
 #ifndef PAPER_H
 #define PAPER_H
@@ -205,8 +205,8 @@ static inline void paper_read_refs(paper_build *p)
 }
 
 /* Builds with one of these builders, as trbvh_build does with its own. Of the options, split_budget is the room for
- * splits, as a share of the triangles; treelet_rounds, 0 for none, are run on what the builder made. references, which may
- * be NULL: how many it made, before leaves merge those of one triangle. */
+ * splits, as a share of the triangles; treelet_rounds, 0 for none, are run on what the builder made. references, which
+ * may be NULL: how many it made, before leaves merge those of one triangle. */
 static inline trbvh_result paper_make(trbvh *bvh, const trbvh_geometry *geometry, const trbvh_options *options,
                                       paper_builder *builder, const void *parameters, uint32_t *references)
 {

@@ -18,20 +18,20 @@
 #include "sweep.h"
 
 enum {
-  PAPER_BINS = 128, PAPER_STRIDE = 8, PAPER_SPATIAL_DEPTH = 48,
+  PAPER_SPATIAL_BINS = 128, PAPER_STRIDE = 8, PAPER_SPATIAL_DEPTH = 48,
   PAPER_LEFT = 1, PAPER_RIGHT = 2, PAPER_BOTH = 3
 };
 typedef struct paper_sbvh_settings {
   float alpha;                         /* least overlap for a spatial split, as a share of the root's area */
-  int   bins;                          /* an axis: up to PAPER_BINS, a multiple of PAPER_STRIDE */
+  int   bins;                          /* an axis: up to PAPER_SPATIAL_BINS, a multiple of PAPER_STRIDE */
   int   unsplit;                       /* 0: every triangle on both sides of the plane is split */
 } paper_sbvh_settings;
 
 typedef struct paper_bins {            /* along an axis, or between two planes only */
   int        axis, count;
-  float      per_unit, plane[PAPER_BINS + 1];   /* bin i is from plane[i] to plane[i + 1] */
-  trbvh_node bin[PAPER_BINS];          /* box, `first`: references that begin here, `count`: that end here */
-  trbvh_node left[PAPER_BINS + 1], right[PAPER_BINS + 1];   /* of plane i: box, `count`: references */
+  float      per_unit, plane[PAPER_SPATIAL_BINS + 1];   /* bin i is from plane[i] to plane[i + 1] */
+  trbvh_node bin[PAPER_SPATIAL_BINS];          /* box, `first`: references that begin here, `count`: that end here */
+  trbvh_node left[PAPER_SPATIAL_BINS + 1], right[PAPER_SPATIAL_BINS + 1];   /* of plane i: box, `count`: references */
 } paper_bins;
 
 typedef struct paper_splitter {
@@ -46,7 +46,7 @@ typedef struct paper_splitter {
   paper_bins          axes[3], fine;
 } paper_splitter;
 
-typedef struct paper_plane { double cost; int axis; float position; } paper_plane;
+typedef struct paper_spatial_plane { double cost; int axis; float position; } paper_spatial_plane;
 typedef struct paper_sides { uint32_t left, right, cut; } paper_sides;   /* references; cut: on both sides */
 typedef struct paper_task { uint32_t slot, begin, end, budget; int depth; } paper_task;
 
@@ -168,7 +168,7 @@ static inline double paper_cost_of(const trbvh_node *left, const trbvh_node *rig
   return (double)trb_area(*left) * left->count + (double)trb_area(*right) * right->count;
 }
 /* The best plane between bins that cuts no more than the budget, where it is better. */
-static inline void paper_sweep_bins(paper_bins *b, const paper_task *t, paper_plane *best)
+static inline void paper_sweep_bins(paper_bins *b, const paper_task *t, paper_spatial_plane *best)
 {
   paper_sum_bins(b);
   for (int i = 1; i < b->count; i++) {
@@ -177,12 +177,12 @@ static inline void paper_sweep_bins(paper_bins *b, const paper_task *t, paper_pl
     if (b->plane[i] <= b->plane[0] || b->plane[i] >= b->plane[b->count]) continue;   /* by rounding */
     if (left->count == 0 || right->count == 0 || count - (t->end - t->begin) > t->budget) continue;
     double cost = paper_cost_of(left, right);
-    if (cost < best->cost) *best = (paper_plane){cost, b->axis, b->plane[i]};
+    if (cost < best->cost) *best = (paper_spatial_plane){cost, b->axis, b->plane[i]};
   }
 }
 /* The planes within coarse bin i. */
 static inline void paper_refine(paper_splitter *s, const paper_task *t, const paper_bins *coarse, int i,
-                                paper_plane *best)
+                                paper_spatial_plane *best)
 {
   paper_bins *b = &s->fine;
   const int k = coarse->axis;
@@ -207,10 +207,10 @@ static inline void paper_refine(paper_splitter *s, const paper_task *t, const pa
 /* The best plane that is better than `bound`. Most references of small nodes reach through many bins. So
  * they are put into eight times wider ones first, and what is left and right of one of these tells whether
  * a plane within it can be better: nearly always, none can. */
-static inline paper_plane paper_best_plane(paper_splitter *s, const paper_task *t, const trbvh_node *box,
+static inline paper_spatial_plane paper_best_plane(paper_splitter *s, const paper_task *t, const trbvh_node *box,
                                            double bound)
 {
-  paper_plane best = {bound, 0, 0};
+  paper_spatial_plane best = {bound, 0, 0};
   int count = s->settings.bins / PAPER_STRIDE, axes = 0;
   for (int k = 0; k < 3; k++) {
     float size = box->max[k] - box->min[k];
@@ -235,7 +235,7 @@ static inline paper_plane paper_best_plane(paper_splitter *s, const paper_task *
 
 // ---- splitting ----
 /* Both halves of a reference; 0 where one is empty. */
-static inline int paper_halve(const paper_build *p, const trbvh_node *ref, const paper_plane *plane,
+static inline int paper_halve(const paper_build *p, const trbvh_node *ref, const paper_spatial_plane *plane,
                               trbvh_node halves[2], int *side)
 {
   float v[3][3];
@@ -260,7 +260,7 @@ static inline int paper_unsplit(const trbvh_node *ref, const trbvh_node halves[2
   return to_left <= to_right ? PAPER_LEFT : PAPER_RIGHT;
 }
 /* Which references go where; changes none of them yet. */
-static inline paper_sides paper_choose_sides(paper_splitter *s, const paper_task *t, const paper_plane *plane)
+static inline paper_sides paper_choose_sides(paper_splitter *s, const paper_task *t, const paper_spatial_plane *plane)
 {
   const uint32_t *order = s->sweep.order[plane->axis];
   paper_sides n = {0, 0, 0};
@@ -385,7 +385,7 @@ static inline paper_sides paper_try_spatial(paper_splitter *s, paper_task *t, co
   double area = trb_area(box), leaf = area * count - area / costs.ratio;   /* worth a split that costs less */
   int may_end = count <= costs.max_leaf && leaf <= cut->cost;
   double bound = may_end ? leaf : cut->cost;
-  paper_plane plane = paper_best_plane(s, t, &box, bound);
+  paper_spatial_plane plane = paper_best_plane(s, t, &box, bound);
   if (plane.cost < bound) return paper_choose_sides(s, t, &plane);
   if (may_end) t->depth = PAPER_SPATIAL_DEPTH;
   return none;
@@ -437,7 +437,7 @@ static inline void paper_sbvh_build(paper_splitter *s)
 }
 static inline paper_splitter *paper_start_sbvh(paper_build *p)
 {
-  static const paper_sbvh_settings usual = {1e-5f, PAPER_BINS, 1};
+  static const paper_sbvh_settings usual = {1e-5f, PAPER_SPATIAL_BINS, 1};
   uint32_t room = p->ref_max;
   paper_splitter *s = (paper_splitter *)ex_allocate(1, sizeof *s);
   s->p = s->sweep.p = p;

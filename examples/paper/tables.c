@@ -70,23 +70,23 @@ static const paper_embree_parameters embree_high = {&peer, RTC_BUILD_QUALITY_HIG
 #endif
 /* The rows of the tables, in their order. The paper's figures: its tables 1 and 2. */
 static const builder builders[] = {
-  {"SweepSAH", "sweep", FIRST_TABLE, paper_sweep, NULL, 0, 0, -1, 3500, {{100, 100, 100}, {0}}},
+  {"SweepSAH", "sweep", FIRST_TABLE, paper_sweep, NULL, 0, 0, -1, 700, {{100, 100, 100}, {0}}},
   {"TRBVH", "trbvh", FIRST_TABLE | SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, -1, 200,
    {{96.0, 94.4, 1.03}, {76.5, 111.5, 0.14}}},
   {"LBVH", "lbvh", FIRST_TABLE, NULL, NULL, TRBVH_QUALITY_FAST, 0, -1, 60, {{69.4, 131.5, 0.28}, {0}}},
-  {"HLBVH", "hlbvh", FIRST_TABLE, paper_hlbvh, NULL, 0, 0, -1, 300, {{67.4, 129.3, 0.57}, {0}}},
-  {"GridSAH", "grid", FIRST_TABLE, paper_grid, NULL, 0, 0, -1, 500, {{68.1, 129.1, 0.70}, {0}}},
-  {"Kensler, climbing", "climb", FIRST_TABLE, paper_kensler_climb, NULL, 0, 0, -1, 3000, {{91.5, 99.6, 552.26}, {0}}},
+  {"HLBVH", "hlbvh", FIRST_TABLE, paper_hlbvh, NULL, 0, 0, -1, 250, {{67.4, 129.3, 0.57}, {0}}},
+  {"GridSAH", "grid", FIRST_TABLE, paper_grid, NULL, 0, 0, -1, 400, {{68.1, 129.1, 0.70}, {0}}},
+  {"Kensler, climbing", "climb", FIRST_TABLE, paper_kensler_climb, NULL, 0, 0, -1, 1500, {{91.5, 99.6, 552.26}, {0}}},
   {"Kensler, annealing", "anneal", FIRST_TABLE, paper_kensler_anneal, NULL, 0, 0, -1, 20000, {{0}, {0}}},
   {"Bittner", "bittner", FIRST_TABLE, paper_bittner, NULL, 0, 0, -1, 15000, {{103.3, 87.7, 1083.24}, {0}}},
   {"Bittner on SweepSAH", "bittner-sweep", FIRST_TABLE, paper_bittner, &from_sweep, 0, 0, -1, 15000, {{0}, {0}}},
-  {"PLOC", "ploc", FIRST_TABLE, paper_ploc, NULL, 0, 0, -1, 800, {{0}, {0}}},
-  {"H-PLOC", "hploc", FIRST_TABLE, paper_hploc, NULL, 0, 0, -1, 800, {{0}, {0}}},
+  {"PLOC", "ploc", FIRST_TABLE, paper_ploc, NULL, 0, 0, -1, 500, {{0}, {0}}},
+  {"H-PLOC", "hploc", FIRST_TABLE, paper_hploc, NULL, 0, 0, -1, 350, {{0}, {0}}},
 #ifdef EX_EMBREE
   {"Embree LOW", "embree-low", FIRST_TABLE, paper_embree, &embree_low, 0, 0, -1, 200, {{0}, {0}}},
   {"Embree MEDIUM", "embree-medium", FIRST_TABLE, paper_embree, &embree_medium, 0, 0, -1, 600, {{0}, {0}}},
 #endif
-  {"SBVH", "sbvh", SECOND_TABLE, paper_sbvh, NULL, 0, 0, 2, 6000, {{0}, {100, 100, 100}}},
+  {"SBVH", "sbvh", SECOND_TABLE, paper_sbvh, NULL, 0, 0, 2, 5000, {{0}, {100, 100, 100}}},
   {"TRBVH, 10 % splits", "trbvh-10", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, 0.1f, 300,
    {{0}, {87.2, 108.8, 0.15}}},
   {"TRBVH, 30 %", "trbvh-30", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, 0.3f, 350,
@@ -404,7 +404,10 @@ typedef struct view { const result *of, *base; double triangles; } view;
 typedef double measure(view v);
 
 static double ratio(double a, double b) { return b > 0 ? 100 * a / b : 0; }
-static double rates_ratio(view v, int turn, int kind) { return ratio(v.of->rates[turn][kind], v.base->rates[turn][kind]); }
+static double rates_ratio(view v, int turn, int kind)
+{
+  return ratio(v.of->rates[turn][kind], v.base->rates[turn][kind]);
+}
 static double performance(view v) { return rates_ratio(v, 0, EX_DIFFUSE); }
 static double performance_n(view v) { return rates_ratio(v, 1, EX_DIFFUSE); }
 static double primary(view v) { return rates_ratio(v, 0, EX_PRIMARY); }
@@ -553,7 +556,7 @@ static void print_metrics(FILE *out, const tables *t, int table)
     {"diffuse, million rays/s", million_rays, 2, 1}, {"all threads", million_rays_n, 2, 1}
   };
   const char *base = builders[base_of(table)].name;
-  fprintf(out, "\nRays and what explains them, %% of %s; nodes and triangles of diffuse rays up to their hits:\n", base);
+  fprintf(out, "\nRays and what explains them, %% of %s; nodes and triangles up to diffuse rays' hits:\n", base);
   print_columns(out, t, table, shares, sizeof shares / sizeof *shares);
   fputs("\nMean depth; times and rates as geometric means:\n", out);
   print_columns(out, t, table, values, sizeof values / sizeof *values);
@@ -653,10 +656,10 @@ static void print_break_even(FILE *out, const tables *t)
 static void print_peers(FILE *out, const tables *t)
 {
   if (!PEERS) return;
-  fprintf(out, "\n### Embree as its users get it: scenes of its own, rtcIntersect1 and rtcOccluded1\n\nGeometric means, beside "
-          "trbvh's. Million rays/s of primary, ambient occlusion and diffuse rays, with one thread and with all.\n\n"
-          "| %-*s | build, ns/triangle | primary | ambient occlusion | diffuse | all threads: build | primary | ambient "
-          "occlusion | diffuse |", NAME, "");
+  fprintf(out, "\n### Embree as its users get it: scenes of its own, rtcIntersect1 and rtcOccluded1\n\nGeometric means, "
+          "beside trbvh's. Million rays/s of primary, ambient occlusion and diffuse rays, with one thread and with all.\n"
+          "\n| %-*s | build, ns/triangle | primary | ambient occlusion | diffuse | all threads: build | primary "
+          "| ambient occlusion | diffuse |", NAME, "");
   print_rule(out, NAME, 8, 6);
   const int own[] = {row_of("lbvh"), row_of("trbvh")};
   for (int i = -2; i < PEERS; i++) {
@@ -724,7 +727,8 @@ static void write_csv(const tables *t)
         s->triangles, of->ref_count, of->leaf_count, of->max_depth, of->sah_cost, r->epo, r->visits.lcv,
         r->visits.nodes, r->visits.triangles, r->ms[0], r->ms[1], of->ms_split, of->ms_morton, of->ms_sort,
         of->ms_hierarchy, of->ms_treelets, of->ms_collapse, of->ms_finish, r->rates[0][0], r->rates[0][1],
-        r->rates[0][2], r->rates[1][0], r->rates[1][1], r->rates[1][2], effective(r, 1e5), effective(r, 1e6), effective(r, 1e7), effective(r, 1e8), effective(r, 1e9)
+        r->rates[0][2], r->rates[1][0], r->rates[1][1], r->rates[1][2], effective(r, 1e5),
+        effective(r, 1e6), effective(r, 1e7), effective(r, 1e8), effective(r, 1e9)
       };
       if (!r->made) continue;
       const char *name = row < BUILDERS ? builders[row].name : peer_names[row - BUILDERS];
@@ -856,8 +860,8 @@ static void write_results(const tables *t)
   plot_builders(t, path[1], performance, "diffuse rays/s, % of SweepSAH", 1);
   plot_effective(t, path[2]);
   plot_scenes(t, path[3]);
-  fputs("# The paper's tables, made again\n\nMade by [tables.c](tables.c). Performance is diffuse rays per second with one "
-        "thread; collapse into leaves, layout and traversal are the same for all trees. \"Paper\" columns: Karras and "
+  fputs("# The paper's tables, made again\n\nMade by [tables.c](tables.c). Performance is diffuse rays per second with "
+        "one thread; collapse into leaves, layout and traversal are the same for all trees. \"Paper\" columns: Karras and "
         "Aila 2013, on a GPU, 20 scenes of theirs.\n", out);
   print_report(out, t, 1);
   fputs("\n## Diagrams\n", out);
