@@ -22,6 +22,13 @@ static void make_bridges(scene *s, uint32_t n)
     }
   }
 }
+static void make_few_floats(scene *s, uint32_t n)   /* fewer coordinates than there are bins */
+{
+  rng r = {23};
+  scene_soup(s, n);
+  for (uint32_t i = 0; i < 9 * n; ++i) s->positions[i] = 1 + (float)rng_below(&r, 24) * FLT_EPSILON;
+}
+static const scene_def few_floats = {"few_floats", make_few_floats, 500, 200, SCENE_ORDINARY};
 static const scene_def bridges = {"bridges", make_bridges, 2000, 500, SCENE_ORDINARY};
 
 /* Calls look for every ordinary scene and the bridges, of about `count` triangles, 0 = as many as it has. */
@@ -95,7 +102,7 @@ static void check_references(const paper_build *p)
       for (int j = 0; i + j <= 16; ++j) {
         double point[3];
         for (int k = 0; k < 3; ++k) point[k] = v[0][k] + (e[0][k] * i + e[1][k] * j) / 16;
-        int inside = inside_some(p->refs, of_prim, count, point, 2 * FLT_EPSILON * big);
+        int inside = inside_some(p->refs, of_prim, count, point, 1e-14 * big);
         CHECK_MSG(inside, "triangle %u has a hole", prim);
       }
   }
@@ -125,6 +132,19 @@ static void look_at_references(const trbvh_geometry *g, const char *name)
   }
 }
 static void test_references(void) { with_scenes(400, look_at_references); }
+static void test_few_floats(void)      /* planes fall together */
+{
+  static const paper_sbvh_settings always = {0, 128, 0};
+  scene s;
+  scene_make(&s, &few_floats);
+  trbvh_geometry g = scene_geometry(&s);
+  for (float budget = 0.02f; budget < 16; budget *= 1.25f) {
+    CONTEXT("budget %g", (double)budget);
+    paper_tree t = make_and_check(&g, sbvh_checked, &always, budget, 0);
+    trbvh_free(&t.bvh);
+  }
+  scene_free(&s);
+}
 
 // >>sbvh ----------------------------------------------------------------------------------------------------
 static void test_sbvh_scenes(void) { paper_test_scenes(paper_sbvh, NULL, 1, 0, 10000); }
@@ -245,6 +265,16 @@ static void split_root(paper_build *p)   /* and no more */
   CHECK(n.cut == p->ref_count - old);
   root_cost = half_area(&box[0]) * n.left + half_area(&box[1]) * n.right;
   root_cut = n.cut;
+  uint32_t at[2] = {0, n.left};
+  paper_divide(s, &t, &n, old, at);    /* both sides still are in order, and complete */
+  for (int axis = 0; axis < 3; ++axis)
+    for (uint32_t i = 0; i < p->ref_count; ++i) {
+      uint32_t ref = s->sweep.order[axis][i], right = i >= n.left;
+      CHECK(right == (ref >= old || s->side[ref] == PAPER_RIGHT));
+      if (i == 0 || i == n.left) continue;
+      uint64_t last = paper_center_key(p, s->sweep.order[axis][i - 1], axis);
+      CHECK(last < paper_center_key(p, ref, axis));
+    }
   paper_end_sbvh(s);
   paper_lbvh(p);                       /* some tree */
 }
@@ -439,8 +469,10 @@ static void test_boxes(void)
     }
   g.boxes = boxes;
   g.count = 500;
-  paper_tree sweep = paper_test_make(&g, paper_sweep, NULL, 0, 0), lbvh = paper_test_make(&g, paper_lbvh, NULL, 0, 0);
-  paper_tree a = paper_test_make(&g, paper_sbvh, &always, 1, 0), b = paper_test_make(&g, paper_esc, NULL, 1, 0);
+  paper_tree sweep = paper_test_make(&g, paper_sweep, NULL, 0, 0);
+  paper_tree lbvh = paper_test_make(&g, paper_lbvh, NULL, 0, 0);
+  paper_tree a = paper_test_make(&g, paper_sbvh, &always, 1, 0);
+  paper_tree b = paper_test_make(&g, paper_esc, NULL, 1, 0);
   paper_tree c = paper_test_make(&g, paper_evh, NULL, 1, 0);
   CHECK(same_tree(&a.bvh, &sweep.bvh) && same_tree(&b.bvh, &lbvh.bvh) && same_tree(&c.bvh, &lbvh.bvh));
   trbvh_free(&a.bvh); trbvh_free(&b.bvh); trbvh_free(&c.bvh); trbvh_free(&sweep.bvh); trbvh_free(&lbvh.bvh);
@@ -477,6 +509,17 @@ static void test_early_known(void)
   CHECK(paper_evh_halve(&piece, halves) == 2);
   CHECK(halves[0].v[1][0] == 4 && halves[0].v[1][1] == 2 && halves[0].v[1][2] == 1 && halves[0].v[0][0] == 0);
   CHECK(halves[1].v[0][0] == 4 && halves[1].v[0][1] == 2 && halves[1].v[0][2] == 1 && halves[1].v[1][0] == 8);
+  for (int k = 0; k < 3; ++k) {        /* the longest side along another axis */
+    float x = piece.v[k][0];
+    piece.v[k][0] = piece.v[k][2];
+    piece.v[k][2] = x;
+  }
+  trb_triangle_box((const float (*)[3])piece.v, &piece.box);
+  CHECK(paper_esc_halve(&piece, halves) == 2 && halves[0].box.max[2] == 4 && halves[1].box.min[2] == 4);
+  put3(piece.v[0], 1, 1, 1); put3(piece.v[1], 1 + FLT_EPSILON, 1 + FLT_EPSILON, 1 + FLT_EPSILON);
+  put3(piece.v[2], 1, 1, 1);           /* nothing is between its corners */
+  CHECK(paper_evh_size(&piece) == 0);
+  put3(piece.v[0], 0, 0, 0); put3(piece.v[2], 8, 0, 0);
   put3(piece.v[1], 8, 0, 2);           /* flat: no edge has a volume */
   CHECK(paper_evh_size(&piece) == 0);
 }
@@ -557,6 +600,7 @@ int main(int argc, char **argv)
 {
   test_start(argc, argv);
   RUN(test_references);
+  RUN(test_few_floats);
   RUN(test_sbvh_scenes);
   RUN(test_sbvh_scenes_starving);
   RUN(test_sbvh_scenes_always);
