@@ -104,12 +104,12 @@ static inline uint32_t paper_sortable(float x)
   return bits >> 31 ? ~bits : bits | 0x80000000u;
 }
 
-/* Puts the references in the order of trbvh's Morton codes, and returns these, paper_code_bits long. The caller frees
- * them. Equal ones stay in the order of the references. */
 static inline uint32_t paper_code_bits(const paper_build *p)
 {
   return p->lib.key_form.packed ? p->lib.key_form.bits : 63;
 }
+/* Puts the references in the order of trbvh's Morton codes, and returns these, paper_code_bits long. The caller frees
+ * them. Equal ones stay in the order of the references. */
 static inline uint64_t *paper_sort_refs(paper_build *p)
 {
   uint64_t *keys = (uint64_t *)ex_allocate(p->ref_count, sizeof *keys);
