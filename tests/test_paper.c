@@ -1,10 +1,13 @@
-/* The builders of examples/paper: valid trees of every scene, the same again, of the quality that theirs must have. */
+/* The builders of examples/paper: valid trees of every scene, the same again, as good as theirs must be, and what each is
+ * known by; and what the tables judge trees by. */
 #define TRB_PACKED_REFS 5000u          /* both kinds of sort keys, at sizes that a test can afford */
 #define TRBVH_IMPLEMENTATION
 #include "../trbvh.h"
 #include "test.h"
 #include "paper.h"
-#include "../examples/paper/sweep.h"
+#include "paper_curve.h"
+#include "paper_moves.h"
+#include "paper_split.h"
 
 // >>what builders share ---------------------------------------------------------------------------------------------
 static void test_sort(void)            /* by the highest bits; equal ones stay as they are */
@@ -232,6 +235,8 @@ static void test_metrics(void)
     CHECK_MSG(fabs(v.nodes - met / n) < 1e-9 * v.nodes, "%g nodes a ray, %g", v.nodes, met / n);
     CHECK_MSG(fabs(v.triangles - triangles / n) < 1e-9 * v.triangles, "%g triangles a ray, %g", v.triangles, triangles / n);
     CHECK_MSG(fabs(v.lcv * v.lcv - variance) < 1e-6 * (1 + variance), "LCV %g, %g", v.lcv, sqrt(variance));
+    paper_thin_rays(&sets[EX_PRIMARY], &bvh, (v.nodes + v.triangles) * 50);
+    CHECK_MSG(sets[EX_PRIMARY].count >= 40 && sets[EX_PRIMARY].count <= 60, "%u rays", (unsigned)sets[EX_PRIMARY].count);
     free(hits);
     for (int kind = 0; kind < EX_KINDS; ++kind) free(sets[kind].rays);
     free(mesh.indices);
@@ -289,6 +294,9 @@ int main(int argc, char **argv)
   RUN(test_sweep_scenes);
   RUN(test_lbvh_scenes);
   RUN(test_lbvh_is_the_library_s);
+  run_curve_tests();
+  run_moves_tests();
+  run_split_tests();
   RUN(test_metrics);
   RUN(test_rays);
   return test_finish();

@@ -1,7 +1,7 @@
-/* The builders of examples/paper that improve a tree, by rotations (Kensler) and insertion (Bittner). */
-#define TRBVH_IMPLEMENTATION
-#include "../trbvh.h"
-#include "test.h"
+/* Tests of the builders of examples/paper that improve a tree, by rotations (Kensler) and insertion (Bittner). Part of
+ * test_paper.c. */
+#ifndef TESTS_PAPER_MOVES_H
+#define TESTS_PAPER_MOVES_H
 #include "paper.h"
 #include "../examples/paper/sweep.h"
 #include "../examples/paper/kensler.h"
@@ -392,7 +392,7 @@ static void test_bittner_from_sweep(void) { paper_test_scenes(paper_bittner, &fr
  * below; on scenes of uniform size, such as a sphere, there is little below the sweep, so a few percent
  * for a start from a linear tree. The margins of 1 % and 4 % are for leaves of several references, which
  * come after all moves: a lower sum of areas has been seen to cost 2.3 % more with them. */
-static void test_quality(void)
+static void test_moves_quality(void)
 {
   double climbs = 0, anneals_sum = 0, insertions = 0, count = 0;
   for (size_t i = 0; i < SCENE_COUNT; ++i) {
@@ -425,9 +425,8 @@ static void test_quality(void)
   CHECK_MSG(insertions < 0.99 * count, "insertion: %.1f %% of the sweep's", 100 * insertions / count);
 }
 
-int main(int argc, char **argv)
+static void run_moves_tests(void)
 {
-  test_start(argc, argv);
   RUN(test_rotations);
   RUN(test_climb_to_the_top);
   RUN(test_anneal_is_no_worse);
@@ -440,6 +439,7 @@ int main(int argc, char **argv)
   RUN(test_anneal_scenes);
   RUN(test_bittner_scenes);
   RUN(test_bittner_from_sweep);
-  RUN(test_quality);
-  return test_finish();
+  RUN(test_moves_quality);
 }
+
+#endif

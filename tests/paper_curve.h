@@ -1,8 +1,7 @@
-/* The builders of examples/paper that go along the Morton curve, HLBVH, GridSAH, PLOC and H-PLOC, and the treelet
- * recursion without dynamic programming. */
-#define TRBVH_IMPLEMENTATION
-#include "../trbvh.h"
-#include "test.h"
+/* Tests of the builders of examples/paper that go along the Morton curve, HLBVH, GridSAH, PLOC and H-PLOC, and of the
+ * treelet recursion without dynamic programming. Part of test_paper.c. */
+#ifndef TESTS_PAPER_CURVE_H
+#define TESTS_PAPER_CURVE_H
 #include "paper.h"
 #include "../examples/paper/sweep.h"
 #include "../examples/paper/hlbvh.h"
@@ -96,7 +95,7 @@ static void test_long_codes(void)
 /* HLBVH and GridSAH choose among planes where LBVH has but one: no ordinary scene is worse for it. PLOC's greed is, on
  * walls of equal squares (room), where LBVH's halves are better than pairs that do not know of each other; by up to 5 %,
  * and on average it is to be better, by 4 % at least. SweepSAH sees all that the two of planes do. */
-static void test_quality(void)
+static void test_curve_quality(void)
 {
   paper_builder *const builders[] = {paper_hlbvh, paper_grid, paper_ploc, paper_hploc};
   double sums[4] = {0}, scenes = 0;
@@ -546,15 +545,14 @@ static void test_random_treelets(void)   /* of triangles, small subtrees and lar
   }
 }
 
-int main(int argc, char **argv)
+static void run_curve_tests(void)
 {
-  test_start(argc, argv);
   RUN(test_hlbvh_scenes);
   RUN(test_grid_scenes);
   RUN(test_ploc_scenes);
   RUN(test_hploc_scenes);
   RUN(test_long_codes);
-  RUN(test_quality);
+  RUN(test_curve_quality);
   RUN(test_hlbvh_clusters);
   RUN(test_hlbvh_one_cluster);
   RUN(test_grid_planes);
@@ -564,5 +562,6 @@ int main(int argc, char **argv)
   RUN(test_hploc_of_few);
   RUN(test_treelets_of_scenes);
   RUN(test_random_treelets);
-  return test_finish();
 }
+
+#endif

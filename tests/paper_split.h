@@ -1,7 +1,6 @@
-/* The builders of examples/paper that split triangles: SBVH, ESC, EVH. */
-#define TRBVH_IMPLEMENTATION
-#include "../trbvh.h"
-#include "test.h"
+/* Tests of the builders of examples/paper that split triangles: SBVH, ESC, EVH. Part of test_paper.c. */
+#ifndef TESTS_PAPER_SPLIT_H
+#define TESTS_PAPER_SPLIT_H
 #include "paper.h"
 #include "../examples/paper/sbvh.h"
 #include "../examples/paper/early.h"
@@ -194,7 +193,7 @@ static int part_of(const float v[9], int axis, double plane, int right, double b
   }
   return some;
 }
-static double area_of(const double box[6])
+static double area_of_box(const double box[6])
 {
   double x = box[3] - box[0], y = box[4] - box[1], z = box[5] - box[2];
   return x * y + y * z + z * x;
@@ -213,7 +212,7 @@ static double plane_cost(const trbvh_geometry *g, int axis, double plane)
       if (is_there && part_of(v, axis, plane, right, boxes[right])) ++counts[right];
     }
   }
-  return counts[0] && counts[1] ? area_of(boxes[0]) * counts[0] + area_of(boxes[1]) * counts[1] : DBL_MAX;
+  return counts[0] && counts[1] ? area_of_box(boxes[0]) * counts[0] + area_of_box(boxes[1]) * counts[1] : DBL_MAX;
 }
 static double best_by_planes(const trbvh_geometry *g, const trbvh_node *box, int bins)
 {
@@ -596,9 +595,8 @@ static void look_at_early_quality(const trbvh_geometry *g, const char *name)
 }
 static void test_early_quality(void) { with_scenes(0, look_at_early_quality); }
 
-int main(int argc, char **argv)
+static void run_split_tests(void)
 {
-  test_start(argc, argv);
   RUN(test_references);
   RUN(test_few_floats);
   RUN(test_sbvh_scenes);
@@ -619,5 +617,6 @@ int main(int argc, char **argv)
   RUN(test_early_known);
   RUN(test_evh_shared_edges);
   RUN(test_early_quality);
-  return test_finish();
 }
+
+#endif
