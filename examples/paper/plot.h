@@ -107,8 +107,8 @@ static inline void paper_frame(const paper_plot *p)
   paper_text(p, p->left, p->top - 10, "start", "#000000", p->y.title);
 }
 
-/* Moves labels that would lie on one another down; x and y in pixels. */
-static inline void paper_spread(paper_label *labels, int count, double wide, double high)
+/* Moves labels that would lie on one another down; they are in one column. */
+static inline void paper_spread(paper_label *labels, int count, double high)
 {
   for (int i = 1; i < count; i++) {    /* from the top down */
     paper_label one = labels[i];
@@ -117,16 +117,45 @@ static inline void paper_spread(paper_label *labels, int count, double wide, dou
     labels[k] = one;
   }
   for (int i = 1; i < count; i++) {
-    for (int k = 0; k < i; k++) {
-      double aside = fabs(labels[i].x - labels[k].x), below = labels[i].y - labels[k].y;
-      if (aside <= wide && below < high && below > -high) labels[i].y = labels[k].y + high;
-    }
+    if (labels[i].y < labels[i - 1].y + high) labels[i].y = labels[i - 1].y + high;
   }
 }
 static inline int paper_by_x(const void *a, const void *b)
 {
   double x = ((const paper_label *)a)->x, y = ((const paper_label *)b)->x;
   return (x > y) - (x < y);
+}
+/* Where a label lies, or a point: x and y are the middle, half sizes. */
+typedef struct paper_area { double x, y, width, height; } paper_area;
+static inline int paper_covers(paper_area a, const paper_area *others, int count)
+{
+  for (int i = 0; i < count; i++) {
+    paper_area b = others[i];
+    if (fabs(a.x - b.x) < a.width + b.width && fabs(a.y - b.y) < a.height + b.height) return 1;
+  }
+  return 0;
+}
+/* Each label beside its point, or a little up or down, with a line to it, where there is room. In pixels. */
+static inline void paper_label_points(const paper_plot *p, const paper_label *points, int count)
+{
+  paper_area *taken = (paper_area *)ex_allocate(2 * (size_t)count, sizeof *taken);
+  for (int i = 0; i < count; i++) taken[i] = (paper_area){points[i].x, points[i].y, 5, 5};
+  for (int i = 0; i < count; i++) {
+    double half = 3.3 * (double)strlen(points[i].text);
+    paper_area at = taken[i];
+    for (int step = 0; step < 40; step++) {   /* to the right, to the left, and again further off */
+      double aside = step % 2 ? -half - 9 : half + 9, away = 9 * (double)((step / 2 + 1) / 2);
+      at = (paper_area){points[i].x + aside, points[i].y + (step / 2 % 2 ? away : -away), half, 6};
+      int across = at.x - half > p->left && at.x + half < p->left + p->width;
+      if (across && at.y > p->top && at.y < p->top + p->height && !paper_covers(at, taken, count + i)) break;
+    }
+    taken[count + i] = at;
+    int right = at.x > points[i].x;
+    double end = points[i].x + (right ? 8 : -8);
+    if (fabs(at.y - points[i].y) > 9) paper_line(p, points[i].x, points[i].y, end, at.y, "#999999", 1);
+    paper_text(p, end, at.y + 4, right ? "start" : "end", "#000000", points[i].text);
+  }
+  free(taken);
 }
 /* Labelled points; those that no other one beats, less y (or more, where `more` is set) at less x, are joined. Reorders
  * them. */
@@ -151,11 +180,7 @@ static inline void paper_plot_points(paper_plot *p, paper_label *points, int cou
     fprintf(p->file, "<circle cx=\"%.1f\" cy=\"%.1f\" r=\"4.5\" fill=\"%s\"/>\n", points[i].x, points[i].y,
             points[i].front ? "#ee6677" : "#4477aa");
   }
-  paper_spread(points, count, 110, 13);
-  for (int i = 0; i < count; i++) {
-    int right = points[i].x < p->left + p->width - 110;
-    paper_text(p, points[i].x + (right ? 8 : -8), points[i].y + 4, right ? "start" : "end", "#000000", points[i].text);
-  }
+  paper_label_points(p, points, count);
 }
 
 #endif

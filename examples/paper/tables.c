@@ -122,7 +122,7 @@ typedef struct result {
   uint32_t references;                 /* that the builder made */
 } result;
 typedef struct scene_results {
-  const char *name;
+  char name[40];
   double triangles;
   size_t rays[EX_KINDS];
   result rows[BUILDERS];
@@ -353,7 +353,8 @@ static void measure_scene(tables *t, const ex_input *in, scene_results *s)
   ex_mesh mesh = ex_load_input(in, t->triangles);
   ex_scene_of(&scene, mesh, 1);
   trbvh_geometry geometry = ex_mesh_geometry(&mesh);
-  s->name = ex_short_name(in);
+  const char *name = ex_short_name(in);
+  snprintf(s->name, sizeof s->name, "%.*s", (int)strcspn(name, "."), name);
   s->triangles = mesh.triangle_count;
   double done = t->progress.done;
   ex_show_progress(&t->progress, s->name, 0);
@@ -793,7 +794,7 @@ static void plot_scenes(const tables *t, const char *name)
   }
   p.x = (paper_axis){0, most > 300 ? 300 : most * 1.02, 0, "diffuse rays/s, % of SweepSAH"};
   p.y = (paper_axis){0, 1, 0, ""};
-  paper_open_plot(&p, name, 790, p.height + 120);
+  paper_open_plot(&p, name, 820, p.height + 120);
   for (double x = 0; x <= p.x.high; x += 50) paper_tick(&p, 0, x);
   for (int k = 0; k < count; k++) {
     double x = 30 + 105 * k, y = 30;
@@ -810,7 +811,7 @@ static void plot_scenes(const tables *t, const char *name)
       if (value <= x) continue;
       char text[32];
       snprintf(text, sizeof text, "%.0f", value);
-      paper_text(&p, p.left + p.width + 4, top + 10 + bar * k, "start", "#000000", text);
+      paper_text(&p, p.left + p.width + (k % 2 ? 4 : 32), top + 12 + bar * k, "start", "#000000", text);
     }
   }
   paper_text(&p, p.left + p.width / 2, p.top + p.height + 36, "middle", "#000000", p.x.title);
@@ -836,7 +837,7 @@ static void plot_effective(const tables *t, const char *name)
     double end = paper_y(&p, effective_mean(t, rows[k], 1e9));
     labels[k] = (paper_label){p.left + p.width + 8, end, builders[rows[k]].name, paper_color(k), 0};
   }
-  paper_spread(labels, count, 1, 14);
+  paper_spread(labels, count, 14);
   for (int k = 0; k < count; k++) {
     paper_text(&p, labels[k].x, labels[k].y + 4, "start", labels[k].color, labels[k].text);
   }
