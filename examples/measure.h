@@ -16,7 +16,7 @@ static inline void ex_show_progress(ex_progress *p, const char *what, double par
   double now = ex_now_ms(), done = (p->done + part) / p->total;
   int terminal = isatty(2);
   char left[32] = "";
-  if (!p->start) p->start = now;
+  if (p->start <= 0) p->start = now;
   if (part > 0 && (!terminal || now - p->shown < 200)) return;
   p->shown = now;
   if (done > 0) {
@@ -275,7 +275,7 @@ static inline void ex_add_path(ex_inputs *inputs, const char *path)
 }
 static inline void ex_add_scene(ex_inputs *inputs, ex_kind kind)
 {
-  ex_input one = {ex_scene_names[kind], kind, 1};
+  ex_input one = {ex_scene_names[kind], (int)kind, 1};
   ex_add_input(inputs, one);
 }
 static inline const char *ex_short_name(const ex_input *in)   /* without folders */

@@ -225,26 +225,6 @@ static double best_by_planes(const trbvh_geometry *g, const trbvh_node *box, int
     }
   return best;
 }
-static double best_by_centers(const trbvh_node *refs, uint32_t count)
-{
-  double best = DBL_MAX;
-  for (int axis = 0; axis < 3; ++axis)
-    for (uint32_t pivot = 0; pivot < count; ++pivot) {
-      trbvh_node side[2] = {trb_no_box(), trb_no_box()};
-      uint32_t counts[2] = {0, 0};
-      for (uint32_t i = 0; i < count; ++i) {
-        float a = 0.5f * refs[i].min[axis] + 0.5f * refs[i].max[axis];
-        float b = 0.5f * refs[pivot].min[axis] + 0.5f * refs[pivot].max[axis];
-        int right = a > b || (a >= b && i >= pivot);
-        side[right] = paper_union(side[right], &refs[i]);
-        ++counts[right];
-      }
-      if (!counts[0] || !counts[1]) continue;
-      double cost = half_area(&side[0]) * counts[0] + half_area(&side[1]) * counts[1];
-      if (cost < best) best = cost;
-    }
-  return best;
-}
 static double root_cost;
 static uint32_t root_cut;
 static void split_root(paper_build *p)   /* and no more */

@@ -926,7 +926,7 @@ static void set_defaults(tables *t)
   if (!t->width) t->width = t->quick ? 48 : 128;
   if (!t->height) t->height = t->quick ? 36 : 96;
   if (!t->samples) t->samples = t->quick ? 2 : 8;
-  if (!t->triangles) t->triangles = t->quick ? 6000 : 100000;
+  if (!t->triangles) t->triangles = t->quick ? 12000 : 100000;
   int built_in = !t->inputs.count;
   for (int kind = EX_TERRAIN; kind <= EX_SLIVERS && built_in; kind++) ex_add_scene(&t->inputs, (ex_kind)kind);
   t->turns = t->threads[1] > 1 ? 2 : 1;
@@ -937,7 +937,8 @@ int main(int argc, char **argv)
   char help[2048];
   size_t used = (size_t)snprintf(help, sizeof help, "%s", usage);
   for (int i = 0; i < BUILDERS; i++) {
-    used += (size_t)snprintf(help + used, sizeof help - used, "%s%s", i % 8 ? ", " : ",\n  " + !i, builders[i].key);
+    const char *before = i == 0 ? "\n  " : i % 8 ? ", " : ",\n  ";
+    used += (size_t)snprintf(help + used, sizeof help - used, "%s%s", before, builders[i].key);
     t.wanted[i] = 1;
   }
   snprintf(help + used, sizeof help - used, "\n");
