@@ -124,7 +124,6 @@ typedef struct result {
 typedef struct scene_results {
   char name[40];
   double triangles;
-  size_t rays[EX_KINDS];
   result rows[BUILDERS];
   result peers[PEERS + 1];             /* Embree's own scenes */
 } scene_results;
@@ -344,22 +343,11 @@ static void measure_peers(const tables *t, const ex_mesh *mesh, const ex_ray_set
 }
 #endif
 
-static void measure_scene(tables *t, const ex_input *in, scene_results *s)
+static void build_all(tables *t, const ex_mesh *mesh, trbvh trees[BUILDERS], scene_results *s)
 {
-  trbvh trees[BUILDERS], first = {0};
-  ex_scene scene;
-  ex_ray_set sets[EX_KINDS];
-  memset(trees, 0, sizeof trees);
-  ex_mesh mesh = ex_load_input(in, t->triangles);
-  ex_scene_of(&scene, mesh, 1);
-  trbvh_geometry geometry = ex_mesh_geometry(&mesh);
-  const char *name = ex_short_name(in);
-  snprintf(s->name, sizeof s->name, "%.*s", (int)strcspn(name, "."), name);
-  s->triangles = mesh.triangle_count;
-  double done = t->progress.done;
-  ex_show_progress(&t->progress, s->name, 0);
+  trbvh_geometry geometry = ex_mesh_geometry(mesh);
 #ifdef EX_EMBREE
-  ex_embree_start(&peer, &mesh, 1);
+  ex_embree_start(&peer, mesh, 1);
 #endif
   for (int i = -1, sbvh = base_of(SECOND_TABLE); i < BUILDERS; i++) {   /* SBVH first: others match its references */
     int row = i < 0 ? sbvh : i;
@@ -371,30 +359,51 @@ static void measure_scene(tables *t, const ex_input *in, scene_results *s)
 #ifdef EX_EMBREE
   ex_embree_stop(&peer);
 #endif
-  trbvh_options usual = {.allocator = {NULL, NULL, NULL}};
-  if (naive_us <= 0) ex_check(paper_make(&first, &geometry, &usual, time_treelets, NULL, NULL), "building", NULL);
-  ex_check(trbvh_build(&first, &geometry, &usual), "building", NULL);
-  paper_make_rays(&scene, &first, t->width, t->height, t->samples, sets);
-  for (int i = 0; i < EX_KINDS; i++) paper_thin_rays(&sets[i], &first, 8e6);
-  paper_points points = paper_make_points(&mesh, t->quick ? 4096 : 32768);
-  answers a = make_answers(&first, sets);
-  for (int i = 0; i < EX_KINDS; i++) s->rays[i] = sets[i].count;
+}
+/* first: the tree that says where rays go, and what they hit */
+static void judge_all(tables *t, const ex_scene *scene, const trbvh *first, const trbvh trees[BUILDERS],
+                      scene_results *s)
+{
+  ex_ray_set sets[EX_KINDS];
+  const ex_ray_set *diffuse = &sets[EX_DIFFUSE];
+  paper_make_rays(scene, first, t->width, t->height, t->samples, sets);
+  for (int i = 0; i < EX_KINDS; i++) paper_thin_rays(&sets[i], first, 8e6);
+  paper_points points = paper_make_points(&scene->mesh, t->quick ? 4096 : 32768);
+  answers a = make_answers(first, sets);
   trace(t, trees, sets, &a, s);
   for (int i = 0; i < BUILDERS; i++) {
-    if (!s->rows[i].made) continue;
-    const ex_ray_set *diffuse = &sets[EX_DIFFUSE];
     size_t step = diffuse->count / 20000 + 1;
+    if (!s->rows[i].made) continue;
     s->rows[i].epo = paper_epo(&trees[i], &points);
     s->rows[i].visits = paper_count_visits(&trees[i], diffuse->rays, a.hits[EX_DIFFUSE], diffuse->count, step);
-    trbvh_free(&trees[i]);
   }
 #ifdef EX_EMBREE
-  measure_peers(t, &mesh, sets, &a, s);
+  measure_peers(t, &scene->mesh, sets, &a, s);
 #endif
-  t->progress.done = done + expected_ns(t, s->triangles);
   for (int i = 0; i < EX_KINDS; i++) free(sets[i].rays);
   free(points.at);
   free_answers(&a);
+}
+static void measure_scene(tables *t, const ex_input *in, scene_results *s)
+{
+  trbvh trees[BUILDERS], first = {0};
+  trbvh_options usual = {.allocator = {NULL, NULL, NULL}};
+  ex_scene scene;
+  memset(trees, 0, sizeof trees);
+  ex_mesh mesh = ex_load_input(in, t->triangles);
+  ex_scene_of(&scene, mesh, 1);
+  trbvh_geometry geometry = ex_mesh_geometry(&mesh);
+  const char *name = ex_short_name(in);
+  snprintf(s->name, sizeof s->name, "%.*s", (int)strcspn(name, "."), name);
+  s->triangles = mesh.triangle_count;
+  double done = t->progress.done;
+  ex_show_progress(&t->progress, s->name, 0);
+  build_all(t, &mesh, trees, s);
+  if (naive_us <= 0) ex_check(paper_make(&first, &geometry, &usual, time_treelets, NULL, NULL), "building", NULL);
+  ex_check(trbvh_build(&first, &geometry, &usual), "building", NULL);
+  judge_all(t, &scene, &first, trees, s);
+  t->progress.done = done + expected_ns(t, s->triangles);
+  for (int i = 0; i < BUILDERS; i++) trbvh_free(&trees[i]);
   trbvh_free(&first);
   ex_mesh_free(&mesh);
 }
@@ -510,15 +519,15 @@ static void print_machine(FILE *out, const tables *t)
   const char *compiler = "unknown compiler";
 #endif
   fprintf(out, "\n%s, %u threads; compiler %s; %u scenes; %ux%u rays from each of %d cameras, %u + %u from each hit; "
-          "medians of %d.\n", cpu, (unsigned)t->threads[t->turns - 1], compiler, (unsigned)t->inputs.count, (unsigned)t->width,
-          (unsigned)t->height, PAPER_CAMERAS, (unsigned)t->samples, (unsigned)t->samples, t->reps);
+          "medians of %d.\n", cpu, (unsigned)t->threads[t->turns - 1], compiler, (unsigned)t->inputs.count,
+          (unsigned)t->width, (unsigned)t->height, PAPER_CAMERAS, (unsigned)t->samples, (unsigned)t->samples, t->reps);
 }
 /* Averages over the scenes, as the paper's; and geometric means, which a few extreme scenes cannot rule. */
 static void print_table(FILE *out, const tables *t, int table)
 {
   static measure *const figures[FIGURES] = {performance, sah, build_time};
-  fprintf(out, "\n### Relative to %s\n\n| %-*s | performance: average | geometric | paper | SAH: average | geometric | paper "
-          "| build: average | geometric | paper | references |", builders[base_of(table)].name, NAME, "%");
+  fprintf(out, "\n### Relative to %s\n\n| %-*s | performance: average | geometric | paper | SAH: average | geometric "
+          "| paper | build: average | geometric | paper | references |", builders[base_of(table)].name, NAME, "%");
   print_rule(out, NAME, 3 * FIGURES + 1, 6);
   for (int row = 0; row < BUILDERS; row++) {
     if (!in_table(t, row, table)) continue;
@@ -561,8 +570,8 @@ static void print_metrics(FILE *out, const tables *t, int table)
     {"diffuse, million rays/s", million_rays, 2, 1}, {"all threads", million_rays_n, 2, 1}
   };
   const char *base = builders[base_of(table)].name;
-  fprintf(out, "\nRays and what explains them, %% of %s, geometric means; nodes and triangles up to diffuse rays' hits:\n",
-          base);
+  fprintf(out, "\nRays and what explains them, %% of %s, geometric means; nodes and triangles up to diffuse rays' "
+          "hits:\n", base);
   print_columns(out, t, table, shares, sizeof shares / sizeof *shares);
   fputs("\nMean depth; times and rates as geometric means:\n", out);
   print_columns(out, t, table, values, sizeof values / sizeof *values);
@@ -646,26 +655,41 @@ static void print_break_even(FILE *out, const tables *t)
   }
   free(at);
   fputs("\nThe best of all, by the geometric mean of rays per second with the build counted:", out);
-  for (double exponent = 5, best_before = -1; exponent <= 9.0001; exponent += 0.02) {
+  for (int step = 0, before = -1; step <= 200; step++) {   /* from 1e5 to 1e9 */
+    double rays = pow(10, 5 + step / 50.0), most = 0;
     int best = -1;
     for (int row = 0; row < BUILDERS; row++) {
-      double rate = t->wanted[row] ? effective_mean(t, row, pow(10, exponent)) : 0;
-      if (rate > 0 && (best < 0 || rate > effective_mean(t, best, pow(10, exponent)))) best = row;
+      double rate = t->wanted[row] ? effective_mean(t, row, rays) : 0;
+      if (rate <= most) continue;
+      most = rate;
+      best = row;
     }
-    if (best < 0 || best == best_before) continue;
-    if (best_before < 0) fprintf(out, " %s", builders[best].name);
-    else fprintf(out, ", from %.3g million rays on %s", pow(10, exponent - 6), builders[best].name);
-    best_before = best;
+    if (best == before) continue;
+    if (before < 0) fprintf(out, " %s", builders[best].name);
+    else fprintf(out, ", from %.3g million rays on %s", rays / 1e6, builders[best].name);
+    before = best;
   }
   fputs(".\n", out);
+}
+static void print_effective(FILE *out, const tables *t)
+{
+  fprintf(out, "\n### Million diffuse rays per second with the build counted, one thread, geometric means\n\n"
+          "| %-*s | of 1e5 rays | 1e6 | 1e7 | 1e8 | 1e9 |", NAME, "");
+  print_rule(out, NAME, 5, 6);
+  for (int row = 0; row < BUILDERS; row++) {
+    if (!t->wanted[row]) continue;
+    fprintf(out, "| %-*s |", NAME, builders[row].name);
+    for (double rays = 1e5; rays < 2e9; rays *= 10) print_cell(out, 6, 3, effective_mean(t, row, rays));
+    fputs("\n", out);
+  }
 }
 static void print_peers(FILE *out, const tables *t)
 {
   if (!PEERS) return;
-  fprintf(out, "\n### Embree as its users get it: scenes of its own, rtcIntersect1 and rtcOccluded1\n\nGeometric means, "
-          "beside trbvh's. Million rays/s of primary, ambient occlusion and diffuse rays, with one thread and with all.\n"
-          "\n| %-*s | build, ns/triangle | primary | ambient occlusion | diffuse | all threads: build | primary "
-          "| ambient occlusion | diffuse |", NAME, "");
+  fprintf(out, "\n### Embree as its users get it: scenes of its own, rtcIntersect1 and rtcOccluded1\n\n"
+          "Geometric means, beside trbvh's. Million rays/s of primary, ambient occlusion and diffuse rays, with one "
+          "thread and with all.\n\n| %-*s | build, ns/triangle | primary | ambient occlusion | diffuse "
+          "| all threads: build | primary | ambient occlusion | diffuse |", NAME, "");
   print_rule(out, NAME, 8, 6);
   const int own[] = {row_of("lbvh"), row_of("trbvh")};
   for (int i = -2; i < PEERS; i++) {
@@ -701,6 +725,7 @@ static void print_report(FILE *out, const tables *t, int with_scenes)
   }
   fputs("\n## Builds\n", out);
   print_stages(out, t);
+  print_effective(out, t);
   print_break_even(out, t);
   print_peers(out, t);
 }
@@ -867,8 +892,8 @@ static void write_results(const tables *t)
   plot_effective(t, path[2]);
   plot_scenes(t, path[3]);
   fputs("# The paper's tables, made again\n\nMade by [tables.c](tables.c). Performance is diffuse rays per second with "
-        "one thread; collapse into leaves, layout and traversal are the same for all trees. \"Paper\" columns: Karras and "
-        "Aila 2013, on a GPU, 20 scenes of theirs.\n", out);
+        "one thread; collapse into leaves, layout and traversal are the same for all trees. \"Paper\" columns: Karras "
+        "and Aila 2013, on a GPU, 20 scenes of theirs.\n", out);
   print_report(out, t, 1);
   fputs("\n## Diagrams\n", out);
   for (int i = 0; i < 4; i++) fprintf(out, "\n![%s](%s)\n", plots[i][1], plots[i][0]);
