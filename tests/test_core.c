@@ -1265,8 +1265,8 @@ static void test_fragments(void) {
 /* The most important plane that crosses a box, found by halving the scene; of equal ones that across the longest side. */
 static void test_median_plane(void) {
   rng r = {11};
-  trbvh_node scene = {{0, 0, 0}, 0, {1024, 1024, 1024}, 0};
-  const trb_grid grid = trb_make_grid(scene);
+  trbvh_node bounds = {{0, 0, 0}, 0, {1024, 1024, 1024}, 0};
+  const trb_grid grid = trb_make_grid(bounds);
   uint32_t i, ties = 0;
   for (i = 0; i < 20000; i++) {
     trbvh_node box;
