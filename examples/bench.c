@@ -133,12 +133,6 @@ static trbvh_options options_of(int preset, uint32_t threads, trbvh_stats *stats
   options.jobs.width = threads;
   return options;
 }
-/* As an engine that rebuilds: memory for the builds of this geometry, or smaller ones. */
-static void keep_scratch(trbvh_options *options, const trbvh_geometry *geometry)
-{
-  trbvh_bytes_bound(geometry, options, &options->scratch_size);
-  options->scratch = ex_allocate(options->scratch_size, 1);
-}
 static void build_trbvh(run *r, const trbvh_geometry *geometry, int preset, uint32_t threads, int rep)
 {
   trbvh_options options = options_of(preset, threads, &r->stats);
@@ -252,7 +246,7 @@ static void measure(bench *b, const ex_input *in, const ex_mesh *mesh, int turn,
     geometries[i] = ex_mesh_geometry(mesh);
     if (i == FROM_BOXES) geometries[i] = (trbvh_geometry){.boxes = boxes->low, .count = mesh->triangle_count};
     runs[i].options = options_of(i, threads, &runs[i].stats);
-    keep_scratch(&runs[i].options, &geometries[i]);
+    ex_keep_scratch(&runs[i].options, &geometries[i]);
   }
 #ifdef EX_EMBREE
   embree e;
@@ -471,7 +465,7 @@ static void bench_small(bench *b)
     for (int i = 0; i < SIZES * PRESETS; i++) {
       trbvh_options options = options_of(i % PRESETS, 1, NULL);
       trbvh_geometry geometry = ex_mesh_geometry(&rocks[i / PRESETS].mesh);
-      keep_scratch(&options, &geometry);
+      ex_keep_scratch(&options, &geometry);
       ms[i / PRESETS][i % PRESETS][rep] = small_ms(&tree, &geometry, &options, b->quick ? 10 : 50);
       free(options.scratch);
     }
@@ -497,38 +491,27 @@ static void bench_small(bench *b)
 
 /* Many meshes in the same arrays: mesh i is the triangles from first[i] to first[i + 1]. */
 typedef struct batch { const ex_mesh *mesh; const uint32_t *first; uint32_t count, threads; int preset; } batch;
-typedef struct share { const batch *of; uint32_t number; pthread_t thread; } share;
 
-static void *build_share(void *context)   /* of the meshes, every threads-th */
+static void build_share(const void *context, uint32_t number)   /* of the meshes, every threads-th */
 {
-  const share *s = (const share *)context;
-  const batch *of = s->of;
+  const batch *of = (const batch *)context;
   trbvh_options options = options_of(of->preset, 1, NULL);
   trbvh_geometry geometry = ex_mesh_geometry(of->mesh);
   trbvh tree = {0};
   geometry.count = 200;                 /* triangles of the largest mesh */
-  keep_scratch(&options, &geometry);
-  for (uint32_t i = s->number; i < of->count; i += of->threads) {
+  ex_keep_scratch(&options, &geometry);
+  for (uint32_t i = number; i < of->count; i += of->threads) {
     geometry.indices = of->mesh->indices + 3 * (size_t)of->first[i];
     geometry.count = of->first[i + 1] - of->first[i];
     ex_check(trbvh_build(&tree, &geometry, &options), "building", NULL);
   }
   trbvh_free(&tree);
   free(options.scratch);
-  return NULL;
 }
 static double batch_ms(const batch *of)
 {
-  share *shares = (share *)ex_allocate(of->threads, sizeof *shares);
   double start = ex_now_ms();
-  for (uint32_t i = of->threads; i-- > 0;) {   /* number 0 is this thread's */
-    shares[i].of = of;
-    shares[i].number = i;
-    if (i == 0) build_share(&shares[i]);
-    else if (pthread_create(&shares[i].thread, NULL, build_share, &shares[i])) ex_die("a thread cannot be started");
-  }
-  for (uint32_t i = 1; i < of->threads; i++) pthread_join(shares[i].thread, NULL);
-  free(shares);
+  ex_run_threads(of->threads, build_share, of);
   return ex_now_ms() - start;
 }
 static void bench_batch(bench *b)

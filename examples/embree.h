@@ -10,8 +10,7 @@
 #define EX_EMBREE_H
 #ifdef EX_EMBREE
 
-#include "common.h"
-#include <pthread.h>
+#include "measure.h"
 #if EX_EMBREE >= 4
   #include <embree4/rtcore.h>
 #else
@@ -214,11 +213,6 @@ typedef struct ex_embree_batch {
   uint8_t *occluded;
   uint32_t threads;
 } ex_embree_batch;
-typedef struct ex_embree_share {
-  const ex_embree_batch *of;
-  uint32_t number;
-  pthread_t thread;
-} ex_embree_share;
 
 static inline struct RTCRay ex_embree_ray(const trbvh_ray *from)
 {
@@ -262,39 +256,26 @@ static inline int ex_embree_occluded(RTCScene scene, const trbvh_ray *from)
 #endif
   return ray.tfar < 0;                 /* -infinity */
 }
-static inline void *ex_embree_trace_share(void *context)   /* of the rays, every threads-th 1024 */
+static inline void ex_embree_trace_share(const void *context, uint32_t number)   /* every threads-th 1024 rays */
 {
   enum { BLOCK = 1024 };
-  const ex_embree_share *share = (const ex_embree_share *)context;
-  const ex_embree_batch *of = share->of;
+  const ex_embree_batch *of = (const ex_embree_batch *)context;
   size_t step = (size_t)of->threads * BLOCK;
-  for (size_t first = (size_t)share->number * BLOCK; first < of->count; first += step) {
+  for (size_t first = (size_t)number * BLOCK; first < of->count; first += step) {
     for (size_t i = first; i < first + BLOCK && i < of->count; i++) {
       if (of->hits) of->hits[i] = ex_embree_closest(of->scene, &of->rays[i]);
       else of->occluded[i] = (uint8_t)ex_embree_occluded(of->scene, &of->rays[i]);
     }
   }
-  return NULL;
 }
 /* Closest hits, or with NULL for hits, 1 in occluded where there is any; on so many threads. Returns ms. */
 static inline double ex_embree_trace(RTCScene scene, const trbvh_ray *rays, size_t count, trbvh_hit *hits,
                                      uint8_t *occluded, uint32_t threads)
 {
   const ex_embree_batch batch = {scene, rays, count, hits, occluded, threads};
-  ex_embree_share *shares = (ex_embree_share *)ex_allocate(threads, sizeof *shares);
   double start = ex_now_ms();
-  for (uint32_t i = threads; i-- > 0;) {   /* number 0 is this thread's */
-    shares[i].of = &batch;
-    shares[i].number = i;
-    if (i == 0) ex_embree_trace_share(&shares[i]);
-    else if (pthread_create(&shares[i].thread, NULL, ex_embree_trace_share, &shares[i])) {
-      ex_die("a thread cannot be started");
-    }
-  }
-  for (uint32_t i = 1; i < threads; i++) pthread_join(shares[i].thread, NULL);
-  double ms = ex_now_ms() - start;
-  free(shares);
-  return ms;
+  ex_run_threads(threads, ex_embree_trace_share, &batch);
+  return ex_now_ms() - start;
 }
 
 #endif /* EX_EMBREE */

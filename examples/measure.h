@@ -1,11 +1,12 @@
-/* measure.h - what programs that measure share: which meshes, from files or made by formula, and the time that is left.
- * Needs POSIX, or MinGW. Where something fails, the program ends.
+/* measure.h - what programs that measure share: which meshes, from files or made by formula, the time that is left,
+ * threads, memory that is kept. Needs POSIX, or MinGW. Where something fails, the program ends.
  */
 #ifndef EX_MEASURE_H
 #define EX_MEASURE_H
 
 #include "common.h"
 #include <dirent.h>
+#include <pthread.h>
 
 // >>progress ------------------------------------------------------------------------------------------------
 typedef struct ex_progress { double start, shown, done, total; } ex_progress;   /* ms; parts of the work, in any unit */
@@ -27,6 +28,37 @@ static inline void ex_show_progress(ex_progress *p, const char *what, double par
   fprintf(stderr, terminal ? "\r%.50s%s      " : "%s%s\n", what, left);
 }
 static inline void ex_clear_progress(void) { if (isatty(2)) fprintf(stderr, "\r%79s\r", ""); }
+
+// >>work ----------------------------------------------------------------------------------------------------
+/* As an engine that rebuilds: memory for the builds of this geometry, or smaller ones. */
+static inline void ex_keep_scratch(trbvh_options *options, const trbvh_geometry *geometry)
+{
+  trbvh_bytes_bound(geometry, options, &options->scratch_size);
+  options->scratch = ex_allocate(options->scratch_size, 1);
+}
+
+typedef void ex_work(const void *context, uint32_t number);
+typedef struct ex_thread { ex_work *work; const void *context; uint32_t number; pthread_t thread; } ex_thread;
+static inline void *ex_thread_main(void *argument)
+{
+  const ex_thread *t = (const ex_thread *)argument;
+  t->work(t->context, t->number);
+  return NULL;
+}
+/* work(context, number) for each number below threads, all at the same time; returns when all are done. */
+static inline void ex_run_threads(uint32_t threads, ex_work *work, const void *context)
+{
+  ex_thread *all = (ex_thread *)ex_allocate(threads, sizeof *all);
+  for (uint32_t i = 1; i < threads; i++) {
+    all[i].work = work;
+    all[i].context = context;
+    all[i].number = i;
+    if (pthread_create(&all[i].thread, NULL, ex_thread_main, &all[i])) ex_die("a thread cannot be started");
+  }
+  work(context, 0);                    /* number 0 is this thread's */
+  for (uint32_t i = 1; i < threads; i++) pthread_join(all[i].thread, NULL);
+  free(all);
+}
 
 // >>scenes --------------------------------------------------------------------------------------------------
 /* Made by formula, so that a program measures something anywhere: first those of different character, then inputs that

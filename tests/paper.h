@@ -52,6 +52,27 @@ static inline void paper_test_scenes(paper_builder *builder, const void *paramet
   }
   CONTEXT("%s", "");
 }
+/* A builder over this scene, made of `count` triangles, for tests that wrap one to look at what is there. */
+static inline void look_at(const scene_def *def, uint32_t count, paper_builder *builder, const void *parameters)
+{
+  scene s;
+  scene_def small = *def;
+  small.full = small.quick = count;
+  scene_make(&s, &small);
+  CONTEXT("scene %s, %u", s.name, count);
+  trbvh_geometry g = scene_geometry(&s);
+  paper_tree t = paper_test_make(&g, builder, parameters, 0, 0);
+  paper_test_tree(&t, &g, 0);
+  trbvh_free(&t.bvh);
+  scene_free(&s);
+}
+static inline void look_at_all(int flags, uint32_t count, paper_builder *builder, const void *parameters)
+{
+  for (size_t i = 0; i < SCENE_COUNT; ++i)
+    if ((scene_defs[i].flags & flags) == flags && scene_defs[i].full >= count)
+      look_at(&scene_defs[i], count, builder, parameters);
+  CONTEXT("%s", "");
+}
 /* SAH of a builder's tree of the scene of this name. */
 static inline double paper_test_sah(const char *name, paper_builder *builder, const void *parameters, float split_budget,
     int rounds)

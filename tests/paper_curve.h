@@ -10,27 +10,6 @@
 #include "../examples/paper/hploc.h"
 #include "../examples/paper/naive.h"
 
-/* A builder over this scene, made of `count` triangles, for tests that wrap one to look at what is there. */
-static void look_at(const scene_def *def, uint32_t count, paper_builder *builder, const void *parameters)
-{
-  scene s;
-  scene_def small = *def;
-  small.full = small.quick = count;
-  scene_make(&s, &small);
-  CONTEXT("scene %s, %u", s.name, count);
-  trbvh_geometry g = scene_geometry(&s);
-  paper_tree t = paper_test_make(&g, builder, parameters, 0, 0);
-  paper_test_tree(&t, &g, 0);
-  trbvh_free(&t.bvh);
-  scene_free(&s);
-}
-static void look_at_all(int flags, uint32_t count, paper_builder *builder, const void *parameters)
-{
-  for (size_t i = 0; i < SCENE_COUNT; ++i)
-    if ((scene_defs[i].flags & flags) == flags && scene_defs[i].full >= count)
-      look_at(&scene_defs[i], count, builder, parameters);
-  CONTEXT("%s", "");
-}
 /* The same tree of every scene from both. */
 static void same_from_both(uint32_t count, paper_builder *one, paper_builder *other, const void *parameters)
 {

@@ -63,21 +63,7 @@ static void sweep_and_look(paper_build *p)
   for (uint32_t i = first; i < first + 2; ++i) cost += half_area(&p->nodes[i]) * trb_count(p->nodes[i].count);
   CHECK_MSG(cost <= best * (1 + 1e-6), "%g, but %g is possible", cost, best);   /* the sweep's areas are floats */
 }
-static void test_sweep_root(void)   /* the best split there is */
-{
-  for (size_t i = 0; i < SCENE_COUNT; ++i) {
-    scene s;
-    if (!(scene_defs[i].flags & SCENE_ORDINARY)) continue;
-    scene_def small = scene_defs[i];
-    small.full = small.quick = 500;
-    scene_make(&s, &small);
-    CONTEXT("scene %s", s.name);
-    trbvh_geometry g = scene_geometry(&s);
-    paper_tree t = paper_test_make(&g, sweep_and_look, NULL, 0, 0);
-    trbvh_free(&t.bvh);
-    scene_free(&s);
-  }
-}
+static void test_sweep_root(void) { look_at_all(SCENE_ORDINARY, 500, sweep_and_look, NULL); }   /* the best there is */
 static void test_sweep_scenes(void) { paper_test_scenes(paper_sweep, NULL, 0, 0, 20000); }
 static void test_lbvh_scenes(void) { paper_test_scenes(paper_lbvh, NULL, 0, 0, 20000); }
 static void test_lbvh_is_the_library_s(void)

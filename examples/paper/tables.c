@@ -175,8 +175,7 @@ static double build_own(const tables *t, trbvh *tree, const trbvh_geometry *geom
 {
   double ms[REPS_MAX];
   options.jobs.width = threads;
-  trbvh_bytes_bound(geometry, &options, &options.scratch_size);
-  options.scratch = ex_allocate(options.scratch_size, 1);
+  ex_keep_scratch(&options, geometry);
   for (int i = -1; i < t->reps; i++) {   /* the first one, which touches fresh memory, does not count */
     double start = ex_now_ms();
     ex_check(trbvh_build(tree, geometry, &options), "building", options.stats);
@@ -442,26 +441,23 @@ static double value_of(const scene_results *s, measure *of, int row, int table) 
   view v = {&s->rows[row], &s->rows[base_of(table)], s->triangles};
   return s->rows[row].made ? of(v) : 0;
 }
-/* Of all scenes; 0 where one of them has none. */
-static double mean(const tables *t, measure *of, int row, int table)
+/* Over the scenes: 0 where the figure of one of them is not known. */
+typedef struct average { double sum, logs; size_t count, known; } average;
+static void add(average *a, double value)
 {
-  double sum = 0;
-  for (size_t i = 0; i < t->inputs.count; i++) {
-    double value = value_of(&t->scenes[i], of, row, table);
-    if (!(value > 0)) return 0;
-    sum += value;
-  }
-  return sum / (double)t->inputs.count;
+  a->count++;
+  if (!(value > 0)) return;
+  a->known++;
+  a->sum += value;
+  a->logs += log(value);
 }
-static double geometric_mean(const tables *t, measure *of, int row, int table)
+static double arithmetic(average a) { return a.known == a.count ? a.sum / (double)a.count : 0; }
+static double geometric(average a) { return a.known == a.count ? exp(a.logs / (double)a.count) : 0; }
+static average average_of(const tables *t, measure *of, int row, int table)
 {
-  double sum = 0;
-  for (size_t i = 0; i < t->inputs.count; i++) {
-    double value = value_of(&t->scenes[i], of, row, table);
-    if (!(value > 0)) return 0;
-    sum += log(value);
-  }
-  return exp(sum / (double)t->inputs.count);
+  average a = {0, 0, 0, 0};
+  for (size_t i = 0; i < t->inputs.count; i++) add(&a, value_of(&t->scenes[i], of, row, table));
+  return a;
 }
 
 /* Million rays/s when `rays` of them are traced and the build is counted, with one thread: R / (build + R / p). */
@@ -472,13 +468,9 @@ static double effective(const result *r, double rays)
 }
 static double effective_mean(const tables *t, int row, double rays)
 {
-  double sum = 0;
-  for (size_t i = 0; i < t->inputs.count; i++) {
-    double rate = effective(&t->scenes[i].rows[row], rays);
-    if (!(rate > 0)) return 0;
-    sum += log(rate);
-  }
-  return exp(sum / (double)t->inputs.count);
+  average a = {0, 0, 0, 0};
+  for (size_t i = 0; i < t->inputs.count; i++) add(&a, effective(&t->scenes[i].rows[row], rays));
+  return geometric(a);
 }
 /* How many rays it takes until the slower build b has paid against a; infinity where it never does. */
 static double break_even(const result *a, const result *b)
@@ -534,11 +526,12 @@ static void print_table(FILE *out, const tables *t, int table)
     fprintf(out, "| %-*s |", NAME, builders[row].name);
     for (int i = 0; i < FIGURES; i++) {
       int decimals = i == BUILD ? 2 : 1;
-      print_cell(out, 6, decimals, mean(t, figures[i], row, table));
-      print_cell(out, 6, decimals, geometric_mean(t, figures[i], row, table));
+      average a = average_of(t, figures[i], row, table);
+      print_cell(out, 6, decimals, arithmetic(a));
+      print_cell(out, 6, decimals, geometric(a));
       print_cell(out, 6, decimals, builders[row].paper[table - 1][i]);
     }
-    print_cell(out, 6, 1, mean(t, references, row, table));
+    print_cell(out, 6, 1, arithmetic(average_of(t, references, row, table)));
     fputs("\n", out);
   }
 }
@@ -552,8 +545,8 @@ static void print_columns(FILE *out, const tables *t, int table, const column *c
     if (!in_table(t, row, table)) continue;
     fprintf(out, "| %-*s |", NAME, builders[row].name);
     for (int i = 0; i < count; i++) {
-      const column *c = &columns[i];
-      print_cell(out, 6, c->decimals, c->geometric ? geometric_mean(t, c->of, row, table) : mean(t, c->of, row, table));
+      average a = average_of(t, columns[i].of, row, table);
+      print_cell(out, 6, columns[i].decimals, columns[i].geometric ? geometric(a) : arithmetic(a));
     }
     fputs("\n", out);
   }
@@ -698,13 +691,13 @@ static void print_peers(FILE *out, const tables *t)
     fprintf(out, "| %-*s |", NAME, i < 0 ? builders[row].name : peer_names[i]);
     for (int k = 0; k < TURNS * (1 + EX_KINDS); k++) {
       int turn = k / (1 + EX_KINDS), kind = k % (1 + EX_KINDS) - 1;
-      double sum = 0;
+      average a = {0, 0, 0, 0};
       for (size_t m = 0; m < t->inputs.count; m++) {
         const scene_results *s = &t->scenes[m];
         const result *r = i < 0 ? &s->rows[row] : &s->peers[i];
-        sum += log(kind < 0 ? r->ms[turn] * 1e6 / s->triangles : r->rates[turn][kind]);
+        add(&a, kind < 0 ? r->ms[turn] * 1e6 / s->triangles : r->rates[turn][kind]);
       }
-      print_cell(out, 6, kind < 0 ? 0 : 2, exp(sum / (double)t->inputs.count));
+      print_cell(out, 6, kind < 0 ? 0 : 2, geometric(a));
     }
     fputs("\n", out);
   }
@@ -782,8 +775,8 @@ static void plot_builders(const tables *t, const char *name, measure *of, const 
   int count = 0;
   double slowest = 0, fastest = DBL_MAX, least = DBL_MAX, most = 0;
   for (int row = 0; row < BUILDERS; row++) {
-    double x = t->wanted[row] ? geometric_mean(t, ns_per_triangle, row, FIRST_TABLE) : 0;
-    double y = x > 0 ? geometric_mean(t, of, row, FIRST_TABLE) : 0;
+    double x = t->wanted[row] ? geometric(average_of(t, ns_per_triangle, row, FIRST_TABLE)) : 0;
+    double y = x > 0 ? geometric(average_of(t, of, row, FIRST_TABLE)) : 0;
     if (!(y > 0)) continue;
     points[count++] = (paper_label){x, y, builders[row].name, NULL, 0};
     fastest = fmin(fastest, x);
