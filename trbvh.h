@@ -199,7 +199,7 @@ typedef struct trbvh_options {
   uint32_t        flags;                 /* TRBVH_NO_... */
   trbvh_quality   quality;
   float           split_budget;          /* extra references as a share of the triangles: 0.3 = 30 %; at most 16. Ignored for boxes */
-  int32_t         treelet_rounds;        /* round r restructures every node of 7 * 2^r references or more */
+  int32_t         treelet_rounds;        /* of restructuring, below */
   uint32_t        max_leaf;              /* primitives in a leaf at most; 0 = 8; above 16 counts as 16 */
   float           cost_node, cost_prim;  /* SAH constants Ci and Ct; 0 = 1.2 and 1.0 (the paper's) */
   trbvh_device   *device;                /* NULL = scalar */
@@ -210,6 +210,11 @@ typedef struct trbvh_options {
   trbvh_stats    *stats;                 /* filled when not NULL, on failure too */
   void           *scratch;               /* memory of yours for one build at a time, so that none is allocated; NULL = allocate it */
   size_t          scratch_size;          /* bytes: what trbvh_bytes_bound says, or more */
+  int32_t         treelet_gamma;         /* references in the smallest subtrees restructured; 0 = 7, the least */
+  float           reinsert_share;        /* of references, candidates for a better place, before each round but the first;
+                                            at most 0.25. Rounds then go from large subtrees to small ones: those of
+                                            gamma * 2^(rounds - 1 - r) references or more in round r; none (negative):
+                                            gamma * 2^r, which is the paper's */
 } trbvh_options;
 struct trbvh_stats {
   double   ms_total, ms_split, ms_morton, ms_sort, ms_hierarchy, ms_treelets, ms_collapse, ms_finish, ms_transfer;   /* with treelets, leaves are chosen in ms_treelets */
@@ -218,6 +223,7 @@ struct trbvh_stats {
   size_t   bytes_result, bytes_scratch;
   int      on_device;                    /* 0 = the scalar code made this tree */
   char     message[256];                 /* why a device was not used, or what failed */
+  double   ms_moves;                     /* reinsertion, between the rounds of ms_treelets */
 };
 
 // >>tree ---- plain data in one block, 64-byte aligned; building again into it reuses the block ---------------------
@@ -1696,6 +1702,366 @@ TRB_SHARED void trb_restructure_top(TRB_GLOBAL trbvh_node *nodes, trb_words word
 }
 #endif
 
+// >>moves ---- beyond the paper: subtrees move to better places, by exact differences of area -----------------------
+/* A batch of moves is searched for in a tree that stands still, each by itself; of those that touch the same pairs of
+ * siblings the one that gains most stays, among equal ones the first; what is left happens at once, and the boxes above
+ * are made anew. So nothing depends on the order in which anything is done. A move touches three pairs: that of the
+ * node which goes away, that of its parent, whose place its sibling takes, and that of its target.
+ *
+ * Every node above a move counts its references. Nodes that are better as leaves stay whole: what is below one of them
+ * does not go away, and is nobody's target. */
+typedef struct trb_move {
+  trbvh_u32 node, target;                /* what goes away; what it is to be the sibling of, or to be merged with */
+  trbvh_u32 above;                       /* above both when the move was found */
+  float     gain;                        /* in half areas; 0: no move; negative: it was one, but had to stand back */
+} trb_move;
+
+typedef struct trb_mover {
+  TRB_GLOBAL trbvh_node *nodes;
+  TRB_GLOBAL trbvh_node *refs;           /* where triangles are split: each one's count tells where it is; else NULL */
+  TRB_GLOBAL trbvh_u32  *parents;        /* by pair: the node above it */
+  TRB_GLOBAL trbvh_u32  *scores;         /* by pair: of both its nodes, while candidates are looked for */
+  TRB_GLOBAL trb_move   *moves;          /* candidates; at most TRB_MOVES_MAX */
+  TRB_GLOBAL trbvh_u32  *owners;         /* by pair: the move that may touch it, TRBVH_NONE outside of a batch ... */
+  TRB_GLOBAL trbvh_u32  *list;           /* ... and nodes whose boxes are to be made anew */
+  trb_costs  costs;
+} trb_mover;
+#define TRB_MOVES_MAX(refs) ((refs) / 4)
+
+/* The scratch memory's four planes, free between the stages, and used so: parents, moves, owners, scores and list. */
+TRB_CORE trb_mover trb_start_moves(TRB_GLOBAL trbvh_node *nodes, TRB_GLOBAL trbvh_node *refs, trb_words words, trb_costs costs) {
+  trb_mover m;
+  m.nodes = nodes;
+  m.refs = refs;
+  m.parents = words.plane[0];
+  m.moves = (TRB_GLOBAL trb_move *)words.plane[1];
+  m.owners = words.plane[2];
+  m.scores = m.list = words.plane[3];
+  m.costs = costs;
+  return m;
+}
+
+/* Pairs that a merge has freed count nothing. */
+TRB_CORE int trb_is_free(trbvh_node n)  { return n.count == 0; }
+TRB_CORE int trb_is_inner(trbvh_node n) { return !trb_is_free(n) && !trb_is_single(n.count); }
+
+/* Puts a node into a slot, and tells those who know where it is. */
+TRB_CORE void trb_put(const trb_mover *m, trbvh_u32 slot, trbvh_node node) {
+  m->nodes[slot] = node;
+  if (!trb_is_single(node.count)) m->parents[node.first / 2] = slot;
+  else if (m->refs) m->refs[node.first].count = slot;
+}
+
+/* The box around two. */
+TRB_CORE trbvh_node trb_join(trbvh_node a, trbvh_node b) {
+  a.min[0] = TRB_MIN(a.min[0], b.min[0]); a.max[0] = TRB_MAX(a.max[0], b.max[0]);
+  a.min[1] = TRB_MIN(a.min[1], b.min[1]); a.max[1] = TRB_MAX(a.max[1], b.max[1]);
+  a.min[2] = TRB_MIN(a.min[2], b.min[2]); a.max[2] = TRB_MAX(a.max[2], b.max[2]);
+  return a;
+}
+
+/* Areas of a pair's nodes, each joined with another node, and by itself. */
+typedef struct trb_areas { float joint[2], own[2]; } trb_areas;
+
+TRB_CORE trb_areas trb_pair_areas(const TRB_GLOBAL trbvh_node *pair, trbvh_node n) {
+  trb_areas areas;
+#if defined(TRB_X86)                     /* the same operations, four areas at a time */
+  const __m128 low = _mm_loadu_ps(n.min), low0 = _mm_loadu_ps(pair[0].min), low1 = _mm_loadu_ps(pair[1].min);
+  const __m128 high = _mm_loadu_ps(n.max), high0 = _mm_loadu_ps(pair[0].max), high1 = _mm_loadu_ps(pair[1].max);
+  const __m128 joint0 = _mm_sub_ps(_mm_max_ps(high0, high), _mm_min_ps(low0, low)), own0 = _mm_sub_ps(high0, low0);
+  const __m128 joint1 = _mm_sub_ps(_mm_max_ps(high1, high), _mm_min_ps(low1, low)), own1 = _mm_sub_ps(high1, low1);
+  const __m128 joint_xy = _mm_unpacklo_ps(joint0, joint1), own_xy = _mm_unpacklo_ps(own0, own1);
+  const __m128 x = _mm_movelh_ps(joint_xy, own_xy), y = _mm_movehl_ps(own_xy, joint_xy);
+  const __m128 z = _mm_movelh_ps(_mm_unpackhi_ps(joint0, joint1), _mm_unpackhi_ps(own0, own1));
+  const __m128 area = _mm_add_ps(_mm_mul_ps(x, y), _mm_mul_ps(z, _mm_add_ps(x, y)));
+  _mm_storeu_ps(areas.joint, _mm_min_ps(area, _mm_set1_ps(FLT_MAX)));
+#else
+  areas.joint[0] = trb_area(trb_join(pair[0], n));
+  areas.joint[1] = trb_area(trb_join(pair[1], n));
+  areas.own[0] = trb_area(pair[0]);
+  areas.own[1] = trb_area(pair[1]);
+#endif
+  return areas;
+}
+
+// ---- Conflicts ----
+TRB_CORE void trb_touched_pairs(const trb_mover *m, trb_move move, trbvh_u32 pairs[3]) {
+  pairs[0] = move.node / 2;
+  pairs[1] = m->parents[move.node / 2] / 2;
+  pairs[2] = move.target / 2;
+}
+
+/* Does move i own all that it touches? */
+TRB_CORE int trb_owns(const trb_mover *m, trbvh_u32 i) {
+  trbvh_u32 pairs[3];
+  trb_touched_pairs(m, m->moves[i], pairs);
+  return m->owners[pairs[0]] == i && m->owners[pairs[1]] == i && m->owners[pairs[2]] == i;
+}
+
+TRB_CORE int trb_precedes(const trb_mover *m, trbvh_u32 i, trbvh_u32 k) {
+  return m->moves[i].gain > m->moves[k].gain || (m->moves[i].gain == m->moves[k].gain && i < k);
+}
+
+/* Two moves could each take the other one's target along, and cut both off from the tree. One that would go into a
+ * subtree which itself goes elsewhere, by a move that precedes it, does not. */
+#define TRB_STAYS 0x80000000u            /* in a move's node: it owns all that it touches, but is not to happen */
+
+TRB_CORE int trb_follows(const trb_mover *m, trbvh_u32 i) {
+  trbvh_u32 node = m->moves[i].target;
+  for (; node != m->moves[i].above && node; node = m->parents[node / 2]) {
+    const trbvh_u32 other = m->owners[node / 2];
+    if (other != TRBVH_NONE && other != i && m->moves[other].gain > 0 && (m->moves[other].node & ~TRB_STAYS) == node &&
+        trb_precedes(m, other, i)) return 1;
+  }
+  return 0;
+}
+
+#if !defined(TRBVH_OPENCL_C) || defined(TRB_CPU)
+TRB_CORE void trb_claim(const trb_mover *m, trbvh_u32 i) {
+  trbvh_u32 pairs[3], k;
+  trb_touched_pairs(m, m->moves[i], pairs);
+  for (k = 0; k < 3; k++) {
+    const trbvh_u32 owner = m->owners[pairs[k]];
+    if (owner == TRBVH_NONE || trb_precedes(m, i, owner)) m->owners[pairs[k]] = i;
+  }
+}
+
+/* Leaves the moves of a batch that are to happen with their gain, all others with none or a negative one. */
+TRB_SHARED void trb_choose_moves(const trb_mover *m, trbvh_u32 count) {
+  trbvh_u32 pairs[3], i, k;
+  for (i = 0; i < count; i++)
+    if (m->moves[i].gain > 0) trb_claim(m, i);
+  for (i = 0; i < count; i++)
+    if (m->moves[i].gain > 0 && !trb_owns(m, i)) m->moves[i].gain = -m->moves[i].gain;
+  for (i = 0; i < count; i++)
+    if (m->moves[i].gain > 0 && trb_follows(m, i)) m->moves[i].node |= TRB_STAYS;
+  for (i = 0; i < count; i++) {
+    TRB_GLOBAL trb_move *move = &m->moves[i];
+    if (move->gain == 0) continue;
+    if (move->node & TRB_STAYS) {
+      move->node &= ~TRB_STAYS;
+      move->gain = -move->gain;
+    }
+    trb_touched_pairs(m, *move, pairs);
+    for (k = 0; k < 3; k++) m->owners[pairs[k]] = TRBVH_NONE;
+  }
+}
+
+/* Lists the nodes above a slot, from below, up to one that is listed already. */
+TRB_CORE trbvh_u32 trb_list_above(const trb_mover *m, trbvh_u32 slot, trbvh_u32 count) {
+  while (slot) {
+    TRB_GLOBAL trbvh_u32 *listed;
+    slot = m->parents[slot / 2];
+    listed = &m->owners[m->nodes[slot].first / 2];
+    if (*listed != TRBVH_NONE) break;
+    *listed = 0;
+    m->list[count++] = slot;
+  }
+  return count;
+}
+
+TRB_CORE void trb_remake(const trb_mover *m, trbvh_u32 node) {
+  const trbvh_u32 pair = m->nodes[node].first;
+  m->nodes[node] = trb_parent(m->nodes[pair], m->nodes[pair + 1], pair, m->costs);
+}
+
+TRB_CORE void trb_remake_listed(const trb_mover *m, trbvh_u32 begin, trbvh_u32 end) {
+  for (; begin < end; begin++) {
+    const trbvh_u32 node = m->list[begin];
+    m->owners[m->nodes[node].first / 2] = TRBVH_NONE;
+    trb_remake(m, node);
+  }
+}
+
+/* Makes all boxes above what has moved anew, each once: a later move's list ends below a node of an earlier one's. */
+TRB_SHARED void trb_remake_moved(const trb_mover *m, trbvh_u32 count) {
+  trbvh_u32 listed = 0, i;
+  for (i = 0; i < count; i++) {
+    TRB_GLOBAL trb_move *move = &m->moves[i];
+    if (!(move->gain > 0)) continue;
+    listed = trb_list_above(m, move->target, move->node = listed);
+    listed = trb_list_above(m, move->above, move->target = listed);
+  }
+  while (i--) {
+    TRB_GLOBAL trb_move *move = &m->moves[i];
+    if (!(move->gain > 0)) continue;
+    trb_remake_listed(m, move->target, listed);
+    trb_remake_listed(m, move->node, move->target);
+    listed = move->node;
+    move->gain = 0;
+  }
+}
+#endif
+
+// >>reinsertion ---- (Bittner, Hapala and Havran 2013; Meister and Bittner 2018) ------------------------------------
+/* Treelets change what is near; a subtree that would be better off far away is taken out and put back where the sum of
+ * all areas grows least. Of the candidates, a given share of all references, every fourth one is searched for at a time,
+ * together with those that had to stand back the time before.
+ *
+ * Candidates are the nodes of the highest score, which is how much smaller than its parent a node is, more where parent
+ * and children differ more. Scores are counted by buckets; the highest that hold the share, whole, are taken. */
+#define TRB_MOVE_BATCHES 4u
+#define TRB_SCORES       2048u           /* buckets, by exponent and three bits more: two scores to a word */
+#define TRB_SCORE_SHIFT  20
+#define TRB_SEARCH_STEPS 64u             /* pairs looked at in one search, at most; and so many wait */
+
+TRB_CORE trbvh_u32 trb_score(float above, float area, float both) {
+  const float ratio = above * trb_reciprocal(TRB_MAX(both, TRB_TINY)), score = (above - area) * ratio;
+  return above > area ? trb_bits(TRB_MIN(score, FLT_MAX)) >> TRB_SCORE_SHIFT : 0;
+}
+
+/* Tells the children of a pair's nodes where those are, and scores the pair, whose parent's box is the one around both;
+ * returns both scores. The root's children are scored like others, and never move. */
+TRB_CORE trbvh_u32 trb_score_pair(const trb_mover *m, trbvh_u32 pair) {
+  const trbvh_node left = m->nodes[2 * pair], right = m->nodes[2 * pair + 1];
+  const trbvh_node parent = trb_parent(left, right, 0, m->costs);
+  trbvh_u32 scores = 0;
+  if (!trb_is_free(left) && !trb_is_leaf(parent.count)) {
+    const float above = trb_area(parent), l = trb_area(left), r = trb_area(right);
+    scores = trb_score(above, l, l + r) << 16 | trb_score(above, r, l + r);
+  }
+  if (trb_is_inner(left)) m->parents[left.first / 2] = 2 * pair;
+  if (trb_is_inner(right)) m->parents[right.first / 2] = 2 * pair + 1;
+  m->scores[pair] = scores;
+  return scores;
+}
+
+/* The lowest bucket to take candidates from, for at least `wanted` of them, where there are so many. */
+TRB_CORE trbvh_u32 trb_lowest_score(const TRB_GLOBAL trbvh_u32 *histogram, trbvh_u32 wanted) {
+  trbvh_u32 lowest = TRB_SCORES, found = 0;
+  while (lowest > 1 && found < wanted) found += histogram[--lowest];
+  return lowest;
+}
+
+/* What a move has to gain, at least. */
+TRB_CORE float trb_least_gain(trbvh_u32 lowest) { return trb_float(lowest << TRB_SCORE_SHIFT) * 0.0625f; }
+
+/* The best other place for a node. Up from its parent; at every node on the way, `saved` is what the areas of those
+ * below it shrink by when the node goes away, its parent's vanishing. From there down into the other child's subtree,
+ * where a node's box grows if something comes in: `rest` is what is left of the gain above a pair, less the area of the
+ * parent that the node will get, which is no smaller than its own. */
+TRB_SHARED trb_move trb_find_place(const trb_mover *m, trbvh_u32 node, float least) {
+  const trbvh_node n = m->nodes[node];
+  const float area = trb_area(n);
+  const trbvh_u32 parent = m->parents[node / 2];
+  trbvh_u32 pivot = parent, other = node ^ 1u, steps = TRB_SEARCH_STEPS, waiting, side, k;
+  struct { float rest; trbvh_u32 pair; } stack[TRB_SEARCH_STEPS + 1];
+  trbvh_node without = m->nodes[other];              /* the pivot without the node */
+  float saved = trb_area(m->nodes[parent]);
+  int shrinks = 1;
+  trb_move best;
+  best.node = node;
+  best.target = best.above = 0;
+  best.gain = least;
+  while (shrinks || saved - area > best.gain) {
+    const trbvh_node there = m->nodes[other];
+    const float joint = trb_area(trb_join(there, n)), rest = saved - joint + trb_area(there);
+    waiting = 0;
+    if (pivot != parent && saved - joint > best.gain) {
+      best.gain = saved - joint;
+      best.target = other;
+      best.above = pivot;
+    }
+    if (!trb_is_leaf(there.count) && rest - area > best.gain) {
+      stack[waiting].rest = rest;
+      stack[waiting++].pair = there.first;
+    }
+    while (waiting && steps) {
+      const float above = stack[--waiting].rest;
+      const trbvh_u32 pair = stack[waiting].pair;
+      trb_areas areas;
+      float below[2];
+      if (!(above - area > best.gain)) continue;
+      steps--;
+      areas = trb_pair_areas(&m->nodes[pair], n);
+      for (side = 0; side < 2; side++) {
+        below[side] = trb_is_leaf(m->nodes[pair + side].count) ? 0 : above - areas.joint[side] + areas.own[side];
+        if (above - areas.joint[side] > best.gain) {
+          best.gain = above - areas.joint[side];
+          best.target = pair + side;
+          best.above = pivot;
+        }
+      }
+      for (side = below[1] > below[0], k = 0; k < 2; k++) {    /* the better one is looked at first */
+        side ^= 1u;
+        if (below[side] - area > best.gain) {
+          stack[waiting].rest = below[side];
+          stack[waiting++].pair = m->nodes[pair + side].first;
+        }
+      }
+    }
+    if (pivot != parent) {
+      const float whole = trb_area(m->nodes[pivot]);
+      if (shrinks) {
+        without = trb_join(without, there);
+        saved += whole - trb_area(without);
+        shrinks = trb_area(without) < whole;
+      }
+      if (pivot && saved - whole > best.gain) {
+        best.gain = saved - whole;
+        best.target = pivot;
+        best.above = m->parents[pivot / 2];
+      }
+    }
+    if (pivot == 0) break;
+    other = pivot ^ 1u;
+    pivot = m->parents[pivot / 2];
+  }
+  if (!best.target) best.gain = 0;
+  return best;
+}
+
+/* Asks for what a search begins with. */
+TRB_CORE void trb_prefetch_above(const trb_mover *m, trbvh_u32 node) {
+  trbvh_u32 k;
+  for (k = 0; k < 4; k++) {
+    TRB_PREFETCH(&m->nodes[node]);
+    node = m->parents[node / 2];
+  }
+}
+
+/* Candidate i in a batch. The root's children have no other place. */
+TRB_CORE void trb_search(const trb_mover *m, trbvh_u32 i, trbvh_u32 batch, float least) {
+  TRB_GLOBAL trb_move *move = &m->moves[i];
+  const trbvh_u32 node = move->node;
+  const int due = i % TRB_MOVE_BATCHES == batch || move->gain < 0;
+  move->gain = 0;
+  if (due && m->parents[node / 2]) *move = trb_find_place(m, node, least);
+}
+
+/* Takes a node out and puts it next to its target. Afterwards the move tells below which nodes something has changed. */
+TRB_CORE void trb_reinsert(const trb_mover *m, TRB_GLOBAL trb_move *move) {
+  const trbvh_u32 slot = move->target, pair = move->node & ~1u, parent = m->parents[pair / 2];
+  const trbvh_node node = m->nodes[move->node], sibling = m->nodes[move->node ^ 1u], target = m->nodes[slot];
+  trb_put(m, parent, sibling);
+  trb_put(m, pair, node);
+  trb_put(m, pair + 1, target);
+  trb_put(m, slot, trb_parent(node, target, pair, m->costs));
+  move->target = pair;
+  move->above = parent;
+}
+
+/* Candidates among the pairs first..end - 1: how many there are; and into the list, from number `at` on. */
+TRB_SHARED trbvh_u32 trb_count_candidates(const trb_mover *m, trbvh_u32 first, trbvh_u32 end, trbvh_u32 lowest) {
+  trbvh_u32 count = 0;
+  for (; first < end; first++) {
+    count += m->scores[first] >> 16 >= lowest;
+    count += (m->scores[first] & 0xFFFFu) >= lowest;
+  }
+  return count;
+}
+
+TRB_SHARED void trb_list_candidates(const trb_mover *m, trbvh_u32 first, trbvh_u32 end, trbvh_u32 lowest, trbvh_u32 at,
+                                    trbvh_u32 most) {
+  trbvh_u32 side;
+  for (; first < end; first++)
+    for (side = 0; side < 2; side++)
+      if ((m->scores[first] >> (side ? 0 : 16) & 0xFFFFu) >= lowest && at < most) {
+        m->moves[at].node = 2 * first + side;
+        m->moves[at++].gain = 0;
+      }
+}
+
 // >>collapse ---- subtrees that are cheaper as leaves become leaves, and the tree moves into its final layout --------
 /* Every small node knows already whether it is better as a leaf (equation 2, trb_parent); the topmost such nodes
  * become leaves. The result has parents before children and right before left: a pair of siblings, all that is below
@@ -1884,11 +2250,11 @@ TRB_CORE trbvh_u32 trb_find_groups(const TRB_GLOBAL trb_task *tasks, trbvh_u32 c
 }
 
 #if !defined(TRBVH_OPENCL_C) || defined(TRB_CPU)
-/* Restructures the subtrees of a group. */
+/* Restructures the subtrees of a group: so many rounds, gamma being doubled from one to the next. */
 TRB_SHARED void trb_restructure_group(const trb_collapser *c, const TRB_GLOBAL trb_task *tasks, trb_group group,
-                                      trbvh_u32 rounds) {
+                                      trbvh_u32 gamma, trbvh_u32 rounds) {
   const trbvh_u32 first_ref = tasks[group.first_task].first_ref;
-  trbvh_u32 gamma = TRB_TREELET, i, seeds;
+  trbvh_u32 i, seeds;
   for (; rounds && gamma <= TRB_BLOCK; rounds--, gamma *= 2) {
     for (i = 0, seeds = 0; i < group.tasks; i++) {
       trbvh_u32 node = tasks[group.first_task + i].node;
@@ -2578,6 +2944,7 @@ static double trb_ms(void) {
 #define TRB_NODE_BYTES sizeof(trbvh_node)
 
 #define TRB_READ_BLOCK 4096u             /* primitives a job reads, or makes triangles of */
+#define TRB_SEARCHES   256u              /* candidates for a move that a job looks at */
 
 /* What one block of primitives came to. */
 typedef struct trb_block {
@@ -2611,6 +2978,8 @@ typedef struct trb_build {
   trb_task             *tasks;
   uint32_t              block_count, task_count, group_count;
   double                sah;             /* equation 1's sum above the tasks */
+  struct { uint32_t gamma, rounds, last; } phase;    /* of treelets */
+  uint32_t              lowest_score, move_count, batch;
   /* parameters of the jobs at work */
   float                 priority_unit;
   trb_u64               scale;
@@ -2680,6 +3049,8 @@ static trbvh_result trb_resolve_options(trb_build *b, const trbvh_options *optio
     return trb_fail(b, TRBVH_INVALID_ARGUMENT, "an allocator needs both alloc and free", 0, 0, 0);
   if (!(o->split_budget <= 16))
     return trb_fail(b, TRBVH_INVALID_ARGUMENT, "split_budget is above 16, or NaN", 0, 0, 0);
+  if (!(o->reinsert_share <= 0.25f))
+    return trb_fail(b, TRBVH_INVALID_ARGUMENT, "reinsert_share is above 0.25, or NaN", 0, 0, 0);
   if (!(o->cost_node <= 1e6f && o->cost_prim <= 1e6f))
     return trb_fail(b, TRBVH_INVALID_ARGUMENT, "cost_node or cost_prim is above 1000000, or NaN", 0, 0, 0);
   fast = o->quality == TRBVH_QUALITY_FAST;
@@ -2689,6 +3060,9 @@ static trbvh_result trb_resolve_options(trb_build *b, const trbvh_options *optio
   if (o->treelet_rounds == 0 && !fast) o->treelet_rounds = 3;
   if (o->treelet_rounds < 0) o->treelet_rounds = 0;
   if (o->treelet_rounds > TRB_ROUNDS_MAX) o->treelet_rounds = TRB_ROUNDS_MAX;
+  if (o->treelet_gamma < TRB_TREELET) o->treelet_gamma = TRB_TREELET;
+  if (o->reinsert_share == 0 && !fast) o->reinsert_share = 0.04f;
+  if (o->reinsert_share < 0) o->reinsert_share = 0;
   if (o->max_leaf == 0) o->max_leaf = 8;
   if (o->max_leaf > TRB_MAX_LEAF) o->max_leaf = TRB_MAX_LEAF;
   if (o->cost_node == 0) o->cost_node = 1.2f;
@@ -3186,6 +3560,87 @@ static trbvh_result trb_build_hierarchy(trb_build *b) {
   return TRBVH_OK;
 }
 
+// ---- Moves ----
+static trb_mover trb_build_mover(const trb_build *b) {
+  return trb_start_moves(b->nodes, b->refs, trb_split_words(b->keys, b->sorted, b->ref_max), b->costs);
+}
+
+/* Blocks of pairs, which are numbered from 0, the root's, to the number of references. */
+static uint32_t trb_pair_blocks(const trb_build *b) { return trb_blocks(b->ref_count, TRB_BLOCK); }
+
+static void trb_score_job(void *context, uint32_t index) {
+  trb_build *b = (trb_build *)context;
+  const trb_mover m = trb_build_mover(b);
+  uint32_t pair = TRB_MAX(1, index * TRB_BLOCK), end = TRB_MIN(b->ref_count, (index + 1) * TRB_BLOCK);
+  uint32_t *histogram = b->histograms + (size_t)index * TRB_SCORES;
+  memset(histogram, 0, TRB_SCORES * sizeof *histogram);
+  for (; pair < end; pair++) {
+    const uint32_t scores = trb_score_pair(&m, pair);
+    histogram[scores >> 16]++;
+    histogram[scores & 0xFFFFu]++;
+  }
+}
+
+static void trb_count_candidates_job(void *context, uint32_t index) {
+  trb_build *b = (trb_build *)context;
+  const trb_mover m = trb_build_mover(b);
+  const uint32_t first = TRB_MAX(1, index * TRB_BLOCK), end = TRB_MIN(b->ref_count, (index + 1) * TRB_BLOCK);
+  b->histograms[index] = trb_count_candidates(&m, first, end, b->lowest_score);
+}
+
+static void trb_list_candidates_job(void *context, uint32_t index) {
+  trb_build *b = (trb_build *)context;
+  const trb_mover m = trb_build_mover(b);
+  const uint32_t first = TRB_MAX(1, index * TRB_BLOCK), end = TRB_MIN(b->ref_count, (index + 1) * TRB_BLOCK);
+  trb_list_candidates(&m, first, end, b->lowest_score, b->histograms[index], TRB_MOVES_MAX(b->ref_count));
+}
+
+/* Lists the candidates for reinsertion: the wanted number, or a few more. */
+static int trb_find_candidates(trb_build *b, uint32_t wanted) {
+  const uint32_t blocks = trb_pair_blocks(b);
+  uint32_t *histogram = b->histograms, block, i, count;
+  trb_build_mover(b).parents[b->nodes[0].first / 2] = 0;
+  if (trb_run(&b->runner, blocks, trb_score_job, b)) return 1;
+  for (block = 1; block < blocks; block++)
+    for (i = 0; i < TRB_SCORES; i++) histogram[i] += histogram[(size_t)block * TRB_SCORES + i];
+  b->lowest_score = trb_lowest_score(histogram, wanted);
+  if (trb_run(&b->runner, blocks, trb_count_candidates_job, b)) return 1;
+  for (block = b->move_count = 0; block < blocks; block++) {
+    count = histogram[block];
+    histogram[block] = b->move_count;
+    b->move_count += count;
+  }
+  b->move_count = TRB_MIN(b->move_count, TRB_MOVES_MAX(b->ref_count));
+  return trb_run(&b->runner, blocks, trb_list_candidates_job, b);
+}
+
+static void trb_search_job(void *context, uint32_t index) {
+  trb_build *b = (trb_build *)context;
+  const trb_mover m = trb_build_mover(b);
+  uint32_t i = index * TRB_SEARCHES, end = TRB_MIN(b->move_count, i + TRB_SEARCHES);
+  for (; i < end; i++) {
+    if (i + 2 * TRB_MOVE_BATCHES < end) trb_prefetch_above(&m, m.moves[i + 2 * TRB_MOVE_BATCHES].node);
+    trb_search(&m, i, b->batch, trb_least_gain(b->lowest_score));
+  }
+}
+
+/* The last batch is for those that had to stand back in the one before. */
+static int trb_reinsert_candidates(trb_build *b) {
+  const trb_mover m = trb_build_mover(b);
+  uint32_t wanted = (uint32_t)(b->options.reinsert_share * (float)b->ref_count), i;
+  if (wanted == 0) return 0;
+  if (trb_find_candidates(b, wanted)) return 1;
+  memset(m.owners, 0xFF, (size_t)b->ref_count * sizeof *m.owners);
+  for (b->batch = 0; b->batch <= TRB_MOVE_BATCHES; b->batch++) {
+    if (trb_run(&b->runner, trb_blocks(b->move_count, TRB_SEARCHES), trb_search_job, b)) return 1;
+    trb_choose_moves(&m, b->move_count);
+    for (i = 0; i < b->move_count; i++)
+      if (m.moves[i].gain > 0) trb_reinsert(&m, &m.moves[i]);
+    trb_remake_moved(&m, b->move_count);
+  }
+  return 0;
+}
+
 // ---- Treelets, and which nodes become leaves ----
 static trb_collapser trb_start_collapse(const trb_build *b) {
   trb_collapser c;
@@ -3206,13 +3661,14 @@ static trb_collapser trb_start_collapse(const trb_build *b) {
 static void trb_group_job(void *context, uint32_t index) {
   const trb_build *b = (const trb_build *)context;
   const trb_collapser c = trb_start_collapse(b);
-  trb_restructure_group(&c, b->tasks, b->groups[index], (uint32_t)b->options.treelet_rounds);
-  trb_settle_group(&c, b->tasks, b->groups[index]);
+  trb_restructure_group(&c, b->tasks, b->groups[index], b->phase.gamma, b->phase.rounds);
+  if (b->phase.last) trb_settle_group(&c, b->tasks, b->groups[index]);
 }
 
+/* The rounds of a phase; and settles the tree, after the last one. */
 static trbvh_result trb_restructure_and_settle(trb_build *b) {
   const trb_collapser c = trb_start_collapse(b);
-  trb_restructure_top(b->nodes, c.words, (uint32_t)b->options.treelet_rounds, b->costs);
+  trb_restructure_top(b->nodes, c.words, b->phase.rounds, b->costs);
   b->task_count = trb_find_tasks(&c, b->final ? b->ranges : NULL, b->tasks, &b->sah);
   b->group_count = trb_find_groups(b->tasks, b->task_count, b->groups);
   if (b->final) return TRBVH_OK;
@@ -3339,6 +3795,33 @@ static double trb_clock(const trb_build *b) { return b->options.stats ? trb_ms()
     b->stats.ms += trb_clock(b) - start; \
   }
 
+/* Rounds of treelets are one phase; with moves between them, each one is. */
+static uint32_t trb_phases(const trb_build *b) {
+  const uint32_t rounds = (uint32_t)b->options.treelet_rounds;
+  return b->options.reinsert_share > 0 && rounds ? rounds : 1;
+}
+
+static void trb_start_phase(trb_build *b, uint32_t phase) {
+  const uint32_t phases = trb_phases(b), gamma = (uint32_t)b->options.treelet_gamma, doubled = phases - 1 - phase;
+  b->phase.last = doubled == 0;
+  b->phase.rounds = phases > 1 ? 1 : (uint32_t)b->options.treelet_rounds;
+  b->phase.gamma = gamma > TRB_REFS_MAX >> doubled ? TRB_REFS_MAX : gamma << doubled;
+}
+
+static trbvh_result trb_run_phases(trb_build *b, float share, float settling) {
+  const uint32_t phases = trb_phases(b);
+  const float part = share / (float)phases;
+  trbvh_result result = TRBVH_OK;
+  uint32_t phase;
+  for (phase = 0; phase < phases; phase++) {
+    trb_start_phase(b, phase);
+    if (phase) { TRB_STAGE(part * 0.25f, ms_moves, trb_reinsert_candidates(b) ? TRBVH_CANCELLED : TRBVH_OK) }
+    if (b->phase.rounds) { TRB_STAGE(phase ? part * 0.75f : part, ms_treelets, trb_restructure_and_settle(b)) }
+    else { TRB_STAGE(settling, ms_collapse, trb_restructure_and_settle(b)) }
+  }
+  return result;
+}
+
 static trbvh_result trb_run_stages(trb_build *b, trbvh *bvh) {
   const float treelets = b->options.treelet_rounds ? 0.65f : 0, split = b->split_max ? 0.15f : 0;
   const float rest = 1 - treelets - split;
@@ -3349,8 +3832,7 @@ static trbvh_result trb_run_stages(trb_build *b, trbvh *bvh) {
   TRB_STAGE(rest * 0.05f, ms_morton, trb_make_keys(b) ? TRBVH_CANCELLED : TRBVH_OK)
   TRB_STAGE(rest * 0.20f, ms_sort, trb_sort_keys(b))
   TRB_STAGE(rest * 0.25f, ms_hierarchy, trb_build_hierarchy(b))
-  if (b->options.treelet_rounds) { TRB_STAGE(treelets, ms_treelets, trb_restructure_and_settle(b)) }
-  else { TRB_STAGE(rest * 0.10f, ms_collapse, trb_restructure_and_settle(b)) }
+  if (!result) result = trb_run_phases(b, treelets, rest * 0.10f);
   TRB_STAGE(rest * 0.10f, ms_collapse, trb_emit(b, bvh))
   trb_free_scratch(b);                               /* before the triangles are touched: less memory at a time */
   TRB_STAGE(rest * 0.15f, ms_finish, trb_finish(b))
