@@ -215,6 +215,7 @@ typedef struct trbvh_options {
                                             at most 0.25. Rounds then go from large subtrees to small ones: those of
                                             gamma * 2^(rounds - 1 - r) references or more in round r; none (negative):
                                             gamma * 2^r, which is the paper's */
+  int32_t         unsplit_passes;        /* over all splits before each round, to take back those that do not pay */
 } trbvh_options;
 struct trbvh_stats {
   double   ms_total, ms_split, ms_morton, ms_sort, ms_hierarchy, ms_treelets, ms_collapse, ms_finish, ms_transfer;   /* with treelets, leaves are chosen in ms_treelets */
@@ -417,6 +418,9 @@ static int trb_simd(void) {
 
 #define TRB_MIN(a, b) ((a) < (b) ? (a) : (b))     /* the second where one is NaN */
 #define TRB_MAX(a, b) ((a) > (b) ? (a) : (b))
+
+/* Added to what boxes are made of, as it makes -0 to 0: boxes then have the same bits in whatever order they are joined. */
+#define TRB_PLUS_ZERO 0.0f
 
 TRB_CORE float trb_abs(float x) { return x < 0 ? -x : x; }
 TRB_CORE int   trb_finite(float x) { return (trb_bits(x) & 0x7F800000u) != 0x7F800000u; }
@@ -795,8 +799,8 @@ TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {
     }
     low -= 0.5f * pad[k];
     high += 0.5f * pad[k];
-    bounds.min[k] = TRB_MAX(low, box->min[k]);
-    bounds.max[k] = TRB_MIN(high, box->max[k]);
+    bounds.min[k] = TRB_MAX(low, box->min[k]) + TRB_PLUS_ZERO;
+    bounds.max[k] = TRB_MIN(high, box->max[k]) + TRB_PLUS_ZERO;
     if (!(bounds.min[k] <= bounds.max[k])) return 0;
   }
   *box = bounds;
@@ -916,8 +920,8 @@ TRB_SHARED int trb_triangle_box(const float v[3][3], trbvh_node *box) {
   int k, finite = 1;
   for (k = 0; k < 3; k++) {
     float low = TRB_MIN(v[0][k], v[1][k]), high = TRB_MAX(v[0][k], v[1][k]);
-    box->min[k] = TRB_MIN(v[2][k], low);
-    box->max[k] = TRB_MAX(v[2][k], high);
+    box->min[k] = TRB_MIN(v[2][k], low) + TRB_PLUS_ZERO;
+    box->max[k] = TRB_MAX(v[2][k], high) + TRB_PLUS_ZERO;
     finite &= trb_finite(v[0][k]) & trb_finite(v[1][k]) & trb_finite(v[2][k]);
   }
   box->first = box->count = 0;
@@ -934,10 +938,12 @@ TRB_SHARED int trb_valid_box(trbvh_node box) {
  * corners go to v. */
 TRB_SHARED int trb_prim_box(const trb_mesh *mesh, trbvh_u32 i, trbvh_node *box, float v[3][3], trbvh_u32 *vertex) {
   const TRB_GLOBAL char *p;
+  int k;
   if (!mesh->boxes) return trb_load_triangle(mesh, i, v, vertex) ? trb_triangle_box((const float (*)[3])v, box) : -1;
   p = (const TRB_GLOBAL char *)mesh->boxes + (size_t)i * mesh->box_stride;
   trb_load_position(box->min, p);
   trb_load_position(box->max, p + 12);
+  for (k = 0; k < 3; k++) { box->min[k] += TRB_PLUS_ZERO; box->max[k] += TRB_PLUS_ZERO; }
   box->first = box->count = 0;
   return trb_valid_box(*box);
 }
@@ -975,7 +981,7 @@ TRB_CORE int trb_read_box(const trb_mesh *mesh, trbvh_u32 form, trb_row *row, tr
     const TRB_GLOBAL char *p = (const TRB_GLOBAL char *)mesh->boxes + prim * mesh->box_stride;
     trb_load_position(a, p);
     trb_load_position(b, p + 12);
-    #define TRB_AXIS(k) row->min[k][i] = a[k]; row->max[k][i] = b[k];
+    #define TRB_AXIS(k) row->min[k][i] = a[k] + TRB_PLUS_ZERO; row->max[k][i] = b[k] + TRB_PLUS_ZERO;
     TRB_AXIS(0) TRB_AXIS(1) TRB_AXIS(2)
     #undef TRB_AXIS
     row->check[i] = (a[0] + a[1] + a[2]) + (b[0] + b[1] + b[2]);
@@ -989,8 +995,8 @@ TRB_CORE int trb_read_box(const trb_mesh *mesh, trbvh_u32 form, trb_row *row, tr
     trb_load_position(c, trb_position(mesh, v2));
     #define TRB_AXIS(k) { \
       float low = TRB_MIN(a[k], b[k]), high = TRB_MAX(a[k], b[k]); \
-      row->min[k][i] = TRB_MIN(c[k], low); \
-      row->max[k][i] = TRB_MAX(c[k], high); }
+      row->min[k][i] = TRB_MIN(c[k], low) + TRB_PLUS_ZERO; \
+      row->max[k][i] = TRB_MAX(c[k], high) + TRB_PLUS_ZERO; }
     TRB_AXIS(0) TRB_AXIS(1) TRB_AXIS(2)
     #undef TRB_AXIS
     row->check[i] = (a[0] + a[1] + a[2]) + (b[0] + b[1] + b[2]) + (c[0] + c[1] + c[2]);
@@ -1232,7 +1238,7 @@ TRB_CORE trbvh_node trb_curve_ref(const trb_curve *c, trb_u64 key) {
   return c->refs[ref];
 }
 
-/* The references of sorted leaves first..first + count - 1, and asks for those that come after, up to `end`. */
+/* The boxes and numbers of sorted leaves first..first + count - 1, and asks for those that come after, up to `end`. */
 TRB_SHARED void trb_read_leaves(const trb_curve *c, trbvh_u32 first, trbvh_u32 count, trbvh_u32 end, trb_row *row) {
   const trbvh_u32 next = first + count, soon = TRB_MIN(next + TRB_ROW, end);
   trbvh_u32 i, k;
@@ -1250,7 +1256,7 @@ TRB_SHARED void trb_read_leaves(const trb_curve *c, trbvh_u32 first, trbvh_u32 c
   for (i = 0; i < count; i++) {
     const trbvh_node ref = c->refs[trb_key_ref(c->keys[first + i], c->form)];
     for (k = 0; k < 3; k++) { row->min[k][i] = ref.min[k]; row->max[k][i] = ref.max[k]; }
-    row->prim[i] = ref.first;
+    row->prim[i] = trb_key_ref(c->keys[first + i], c->form);
   }
 }
 
@@ -1878,16 +1884,18 @@ TRB_SHARED void trb_remake_moved(const trb_mover *m, trbvh_u32 count) {
   trbvh_u32 listed = 0, i;
   for (i = 0; i < count; i++) {
     TRB_GLOBAL trb_move *move = &m->moves[i];
-    if (!(move->gain > 0)) continue;
-    listed = trb_list_above(m, move->target, move->node = listed);
-    listed = trb_list_above(m, move->above, move->target = listed);
+    const trb_move moved = *move;
+    if (!(moved.gain > 0)) continue;
+    move->target = listed;               /* where its lists begin */
+    move->above = listed = trb_list_above(m, moved.target, listed);
+    listed = trb_list_above(m, moved.above, listed);
   }
   while (i--) {
     TRB_GLOBAL trb_move *move = &m->moves[i];
     if (!(move->gain > 0)) continue;
-    trb_remake_listed(m, move->target, listed);
-    trb_remake_listed(m, move->node, move->target);
-    listed = move->node;
+    trb_remake_listed(m, move->above, listed);
+    trb_remake_listed(m, move->target, move->above);
+    listed = move->target;
     move->gain = 0;
   }
 }
@@ -2062,6 +2070,109 @@ TRB_SHARED void trb_list_candidates(const trb_mover *m, trbvh_u32 first, trbvh_u
       }
 }
 
+// >>unsplit ---- splits that do not pay are taken back ----------------------------------------------------------------
+/* Splits are spent before there is a tree, on what they may gain. Once there is one, every two neighbouring references
+ * of a triangle are looked at: one goes away, and the other one's box grows around it, where that makes the expected
+ * cost less. Pieces that could all go together may each seem worth keeping: what is saved counts TRB_UNSPLIT_BIAS times.
+ * Grown leaves then want to be reinserted.
+ *
+ * While a tree with splits is worked on, its leaves hold references, those of a triangle in a row among refs, in the
+ * order of its splits; the primitive takes their place in the end. */
+#define TRB_UNSPLIT_BIAS 2.0f
+
+/* One of the two sides of a merge, on its way up from a leaf to the lowest node above both. */
+typedef struct trb_climb {
+  trbvh_u32  slot, below;                /* a node above the leaf, its child on the way */
+  trbvh_u32  height;
+  trbvh_node without;                    /* that node without the leaf */
+  float      saved, grown;               /* what costs shrink by when the leaf goes away; what they grow by when the other one comes in */
+} trb_climb;
+
+TRB_CORE trb_climb trb_start_climb(trbvh_u32 slot, trbvh_node leaf) {
+  trb_climb c;
+  c.slot = c.below = slot;
+  c.height = 0;
+  c.without = leaf;
+  c.saved = c.grown = 0;
+  return c;
+}
+
+/* Accounts for a node that turns out not to be above both, and leaves it. */
+TRB_CORE void trb_climb_on(const trb_mover *m, trb_climb *c, trbvh_node leaf) {
+  const trbvh_node n = m->nodes[c->slot];
+  const float area = trb_area(n), weight = c->height == 0 ? m->costs.ratio : 1;
+  c->grown += weight * (trb_area(trb_join(n, leaf)) - area);
+  if (c->height == 0) {
+    c->saved = weight * area;
+  } else if (c->height == 1) {           /* the parent vanishes with it */
+    c->saved += area;
+    c->without = m->nodes[c->below ^ 1u];
+  } else {
+    c->without = trb_join(c->without, m->nodes[c->below ^ 1u]);
+    c->saved += area - trb_area(c->without);
+  }
+  c->height++;
+  c->below = c->slot;
+  c->slot = m->parents[c->slot / 2];
+}
+
+/* The better way to merge two references of a triangle. The smaller of two nodes cannot be above the other one. */
+TRB_SHARED trb_move trb_find_merge(const trb_mover *m, trbvh_u32 left, trbvh_u32 right) {
+  const trbvh_u32 left_slot = m->refs[left].count, right_slot = m->refs[right].count;
+  const trbvh_node left_leaf = m->nodes[left_slot], right_leaf = m->nodes[right_slot];
+  trb_climb l = trb_start_climb(left_slot, left_leaf), r = trb_start_climb(right_slot, right_leaf);
+  float keep_left, keep_right;
+  trb_move merge;
+  while (l.slot != r.slot) {
+    if (trb_count(m->nodes[l.slot].count) <= trb_count(m->nodes[r.slot].count)) trb_climb_on(m, &l, right_leaf);
+    else trb_climb_on(m, &r, left_leaf);
+  }
+  if (l.height == 1) l.saved += trb_area(m->nodes[l.slot]);
+  if (r.height == 1) r.saved += trb_area(m->nodes[r.slot]);
+  keep_left = TRB_UNSPLIT_BIAS * r.saved - l.grown;
+  keep_right = TRB_UNSPLIT_BIAS * l.saved - r.grown;
+  merge.node = keep_left >= keep_right ? right_slot : left_slot;
+  merge.target = keep_left >= keep_right ? left_slot : right_slot;
+  merge.above = merge.target;            /* no subtree moves, so that nothing can be cut off */
+  merge.gain = TRB_MAX(keep_left, keep_right);
+  merge.gain = TRB_MAX(merge.gain, 0.0f);
+  return merge;
+}
+
+/* Where a reference is: tells refs, and marks those that are nowhere. */
+TRB_CORE void trb_find_ref(const trb_mover *m, trbvh_u32 slot) {
+  const trbvh_node n = m->nodes[slot];
+  if (slot == 1 || trb_is_free(n)) return;
+  if (trb_is_single(n.count)) m->refs[n.first].count = slot;
+  else m->parents[n.first / 2] = slot;
+}
+
+/* The merge of reference i and the next one of its triangle that is still there; of every fourth one in a batch. */
+TRB_CORE void trb_search_merge(const trb_mover *m, trbvh_u32 i, trbvh_u32 slots) {
+  TRB_GLOBAL trb_move *move = &m->moves[i / TRB_MOVE_BATCHES];
+  const trbvh_u32 prim = m->refs[i].first;
+  trbvh_u32 next = i + 1;
+  move->gain = 0;
+  if (prim == TRBVH_NONE || m->refs[i].count == TRBVH_NONE) return;
+  while (next < slots && m->refs[next].first == prim && m->refs[next].count == TRBVH_NONE) next++;
+  if (next < slots && m->refs[next].first == prim) *move = trb_find_merge(m, i, next);
+}
+
+/* Takes a leaf away, its sibling getting their parent's place, and grows another one. Afterwards the move tells below
+ * which nodes something has changed. */
+TRB_CORE void trb_merge(const trb_mover *m, TRB_GLOBAL trb_move *move) {
+  const trbvh_u32 pair = move->node & ~1u, parent = m->parents[pair / 2];
+  const trbvh_node gone = m->nodes[move->node];
+  trbvh_node grown = trb_join(m->nodes[move->target], gone);
+  grown = trb_reference(grown, m->costs);
+  m->nodes[move->target] = grown;
+  trb_put(m, parent, m->nodes[move->node ^ 1u]);
+  m->refs[gone.first].count = TRBVH_NONE;
+  m->nodes[pair].count = m->nodes[pair + 1].count = 0;
+  if (move->target == (move->node ^ 1u)) move->target = parent;
+  move->above = parent;
+}
+
 // >>collapse ---- subtrees that are cheaper as leaves become leaves, and the tree moves into its final layout --------
 /* Every small node knows already whether it is better as a leaf (equation 2, trb_parent); the topmost such nodes
  * become leaves. The result has parents before children and right before left: a pair of siblings, all that is below
@@ -2081,7 +2192,7 @@ typedef struct trb_collapser {
   trb_words words;
   trb_costs costs;
   float     cost_node, cost_prim;
-  trbvh_u32 split;                       /* not 0: one primitive may have several references */
+  const TRB_GLOBAL trbvh_node *refs;     /* where triangles are split: what leaves refer to, several maybe to one primitive */
   const TRB_GLOBAL trb_u64 *keys;        /* sorted, of a final tree: ref_count, of this form */
   trb_key_form form;
   trbvh_u32    ref_count;
@@ -2161,8 +2272,9 @@ TRB_CORE trbvh_u32 trb_leaf_prims(const trb_collapser *c, trbvh_node leaf, trbvh
       leaf = c->nodes[leaf.first + 1];
       continue;
     }
-    for (i = 0; c->split && i < count && prims[i] != leaf.first; i++) {}
-    if (!c->split || i == count) prims[count++] = leaf.first;
+    if (c->refs) leaf.first = c->refs[leaf.first].first;
+    for (i = 0; c->refs && i < count && prims[i] != leaf.first; i++) {}
+    if (!c->refs || i == count) prims[count++] = leaf.first;
     if (waiting == 0) return count;
     leaf = c->nodes[stack[--waiting]];
   }
@@ -2979,6 +3091,7 @@ typedef struct trb_build {
   uint32_t              block_count, task_count, group_count;
   double                sah;             /* equation 1's sum above the tasks */
   struct { uint32_t gamma, rounds, last; } phase;    /* of treelets */
+  uint32_t              slot_count;      /* of refs, gaps among them */
   uint32_t              lowest_score, move_count, batch;
   /* parameters of the jobs at work */
   float                 priority_unit;
@@ -3063,6 +3176,8 @@ static trbvh_result trb_resolve_options(trb_build *b, const trbvh_options *optio
   if (o->treelet_gamma < TRB_TREELET) o->treelet_gamma = TRB_TREELET;
   if (o->reinsert_share == 0 && !fast) o->reinsert_share = 0.04f;
   if (o->reinsert_share < 0) o->reinsert_share = 0;
+  if (o->unsplit_passes == 0 && high) o->unsplit_passes = 3;
+  if (o->unsplit_passes < 0) o->unsplit_passes = 0;
   if (o->max_leaf == 0) o->max_leaf = 8;
   if (o->max_leaf > TRB_MAX_LEAF) o->max_leaf = TRB_MAX_LEAF;
   if (o->cost_node == 0) o->cost_node = 1.2f;
@@ -3368,6 +3483,7 @@ static trbvh_result trb_split(trb_build *b) {
     block->slots = block->refs + (uint32_t)block->splits;
     start += block->slots;
   }
+  b->slot_count = start;
   if (trb_run(&b->runner, b->block_count, trb_split_job, b)) return TRBVH_CANCELLED;
   for (i = 0, b->ref_count = 0; i < b->block_count; i++) b->ref_count += b->blocks[i].refs;
   return TRBVH_OK;
@@ -3598,8 +3714,8 @@ static void trb_list_candidates_job(void *context, uint32_t index) {
 /* Lists the candidates for reinsertion: the wanted number, or a few more. */
 static int trb_find_candidates(trb_build *b, uint32_t wanted) {
   const uint32_t blocks = trb_pair_blocks(b);
-  uint32_t *histogram = b->histograms, block, i, count;
-  trb_build_mover(b).parents[b->nodes[0].first / 2] = 0;
+  uint32_t *histogram = b->histograms, *parents = trb_build_mover(b).parents, block, i, count;
+  parents[0] = parents[b->nodes[0].first / 2] = 0;
   if (trb_run(&b->runner, blocks, trb_score_job, b)) return 1;
   for (block = 1; block < blocks; block++)
     for (i = 0; i < TRB_SCORES; i++) histogram[i] += histogram[(size_t)block * TRB_SCORES + i];
@@ -3641,6 +3757,45 @@ static int trb_reinsert_candidates(trb_build *b) {
   return 0;
 }
 
+static void trb_forget_refs_job(void *context, uint32_t index) {
+  const trb_build *b = (const trb_build *)context;
+  uint32_t i = index * TRB_BLOCK, end = TRB_MIN(b->slot_count, i + TRB_BLOCK);
+  for (; i < end; i++) b->refs[i].count = TRBVH_NONE;
+}
+
+static void trb_find_refs_job(void *context, uint32_t index) {
+  const trb_build *b = (const trb_build *)context;
+  const trb_mover m = trb_build_mover(b);
+  uint32_t i = 2 * index * TRB_BLOCK, end = 2 * TRB_MIN(b->ref_count, (index + 1) * TRB_BLOCK);
+  for (; i < end; i++) trb_find_ref(&m, i);
+}
+
+static void trb_search_merges_job(void *context, uint32_t index) {
+  const trb_build *b = (const trb_build *)context;
+  const trb_mover m = trb_build_mover(b);
+  uint32_t i = index * TRB_SEARCHES, end = TRB_MIN(b->move_count, i + TRB_SEARCHES);
+  for (; i < end; i++) trb_search_merge(&m, i * TRB_MOVE_BATCHES + b->batch, b->slot_count);
+}
+
+static int trb_unsplit(trb_build *b) {
+  const trb_mover m = trb_build_mover(b);
+  int32_t pass;
+  uint32_t i;
+  if (!b->refs || trb_run(&b->runner, trb_blocks(b->slot_count, TRB_BLOCK), trb_forget_refs_job, b) ||
+      trb_run(&b->runner, trb_pair_blocks(b), trb_find_refs_job, b)) return b->runner.cancelled;
+  memset(m.owners, 0xFF, (size_t)b->ref_count * sizeof *m.owners);
+  b->move_count = TRB_MOVES_MAX(b->slot_count);
+  for (pass = 0; pass < b->options.unsplit_passes; pass++)
+    for (b->batch = 0; b->batch < TRB_MOVE_BATCHES; b->batch++) {
+      if (trb_run(&b->runner, trb_blocks(b->move_count, TRB_SEARCHES), trb_search_merges_job, b)) return 1;
+      trb_choose_moves(&m, b->move_count);
+      for (i = 0; i < b->move_count; i++)
+        if (m.moves[i].gain > 0) trb_merge(&m, &m.moves[i]);
+      trb_remake_moved(&m, b->move_count);
+    }
+  return 0;
+}
+
 // ---- Treelets, and which nodes become leaves ----
 static trb_collapser trb_start_collapse(const trb_build *b) {
   trb_collapser c;
@@ -3649,7 +3804,7 @@ static trb_collapser trb_start_collapse(const trb_build *b) {
   c.costs = b->costs;
   c.cost_node = b->options.cost_node;
   c.cost_prim = b->options.cost_prim;
-  c.split = b->split_max != 0;
+  c.refs = b->refs;
   c.keys = b->keys;
   c.form = b->key_form;
   c.ref_count = b->ref_count;
@@ -3815,7 +3970,11 @@ static trbvh_result trb_run_phases(trb_build *b, float share, float settling) {
   uint32_t phase;
   for (phase = 0; phase < phases; phase++) {
     trb_start_phase(b, phase);
-    if (phase) { TRB_STAGE(part * 0.25f, ms_moves, trb_reinsert_candidates(b) ? TRBVH_CANCELLED : TRBVH_OK) }
+    if (b->split_max && b->options.unsplit_passes) {
+      TRB_STAGE(part * 0.25f, ms_moves, trb_unsplit(b) || trb_reinsert_candidates(b) ? TRBVH_CANCELLED : TRBVH_OK)
+    } else if (phase) {
+      TRB_STAGE(part * 0.25f, ms_moves, trb_reinsert_candidates(b) ? TRBVH_CANCELLED : TRBVH_OK)
+    }
     if (b->phase.rounds) { TRB_STAGE(phase ? part * 0.75f : part, ms_treelets, trb_restructure_and_settle(b)) }
     else { TRB_STAGE(settling, ms_collapse, trb_restructure_and_settle(b)) }
   }
