@@ -213,7 +213,7 @@ typedef struct trbvh_options {
   int32_t         treelet_gamma;         /* references in the smallest subtrees restructured; 0 = 7, the least */
   float           reinsert_share;        /* of references, candidates for a better place, before each round but the first;
                                             at most 0.25. Rounds then go from large subtrees to small ones: those of
-                                            gamma * 2^(rounds - 1 - r) references or more in round r; none (negative):
+                                            gamma * 4^(rounds - 1 - r) references or more in round r; none (negative):
                                             gamma * 2^r, which is the paper's */
   int32_t         unsplit_passes;        /* over all splits before each round, to take back those that do not pay */
 } trbvh_options;
@@ -1914,8 +1914,9 @@ TRB_SHARED void trb_remake_moved(const trb_mover *m, trbvh_u32 count) {
 #define TRB_SEARCH_STEPS 64u             /* pairs looked at in one search, at most; and so many wait */
 
 TRB_CORE trbvh_u32 trb_score(float above, float area, float both) {
-  const float ratio = above * trb_reciprocal(TRB_MAX(both, TRB_TINY)), score = (above - area) * ratio;
-  return above > area ? trb_bits(TRB_MIN(score, FLT_MAX)) >> TRB_SCORE_SHIFT : 0;
+  const float tame = TRB_MIN(both, 1 / TRB_TINY), ratio = above * trb_reciprocal(TRB_MAX(tame, TRB_TINY));
+  const float score = (above - area) * ratio;
+  return score > 0 ? trb_bits(TRB_MIN(score, FLT_MAX)) >> TRB_SCORE_SHIFT : 0;       /* not where areas overflow to NaN */
 }
 
 /* Tells the children of a pair's nodes where those are, and scores the pair, whose parent's box is the one around both;
@@ -3168,7 +3169,7 @@ static trbvh_result trb_resolve_options(trb_build *b, const trbvh_options *optio
     return trb_fail(b, TRBVH_INVALID_ARGUMENT, "cost_node or cost_prim is above 1000000, or NaN", 0, 0, 0);
   fast = o->quality == TRBVH_QUALITY_FAST;
   high = o->quality >= TRBVH_QUALITY_HIGH;
-  if (o->split_budget == 0 && high) o->split_budget = 0.3f;
+  if (o->split_budget == 0 && high) o->split_budget = 0.2f;
   if (o->split_budget < 0 || b->input.boxes) o->split_budget = 0;
   if (o->treelet_rounds == 0 && !fast) o->treelet_rounds = 3;
   if (o->treelet_rounds < 0) o->treelet_rounds = 0;
@@ -3957,10 +3958,11 @@ static uint32_t trb_phases(const trb_build *b) {
 }
 
 static void trb_start_phase(trb_build *b, uint32_t phase) {
-  const uint32_t phases = trb_phases(b), gamma = (uint32_t)b->options.treelet_gamma, doubled = phases - 1 - phase;
-  b->phase.last = doubled == 0;
+  const uint32_t phases = trb_phases(b), gamma = (uint32_t)b->options.treelet_gamma;
+  const uint32_t shift = TRB_MIN(2 * (phases - 1 - phase), 31u);
+  b->phase.last = phase + 1 == phases;
   b->phase.rounds = phases > 1 ? 1 : (uint32_t)b->options.treelet_rounds;
-  b->phase.gamma = gamma > TRB_REFS_MAX >> doubled ? TRB_REFS_MAX : gamma << doubled;
+  b->phase.gamma = gamma > TRB_REFS_MAX >> shift ? TRB_REFS_MAX : gamma << shift;
 }
 
 static trbvh_result trb_run_phases(trb_build *b, float share, float settling) {

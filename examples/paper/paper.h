@@ -221,6 +221,7 @@ static inline trbvh_result paper_make(trbvh *bvh, const trbvh_geometry *geometry
   trb_runner_start(&b->runner, &b->options, 1);
   if (!result && b->input.count) result = trb_allocate_scratch(b);
   if (!result && b->input.count) result = trb_read(b);
+  b->refs = NULL;                      /* its leaves hold primitives, not references */
   if (!result && b->ref_count) {
     p.ref_max = b->ref_max;
     p.refs = (trbvh_node *)ex_allocate(p.ref_max, sizeof *p.refs);
@@ -232,6 +233,7 @@ static inline trbvh_result paper_make(trbvh *bvh, const trbvh_geometry *geometry
     else builder(&p);
     b->ref_count = p.ref_count;
     b->stats.ms_hierarchy = ex_now_ms() - start;
+    trb_start_phase(b, 0);
     result = trb_restructure_and_settle(b);
     b->stats.ms_treelets = ex_now_ms() - start - b->stats.ms_hierarchy;
     if (!result) result = trb_emit(b, bvh);
