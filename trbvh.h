@@ -32,9 +32,11 @@
  *
  * CHOOSING A PRESET (trbvh_options.quality)
  *   FAST    LBVH and collapse: for trees that see fewer than some three rays a triangle, then are rebuilt
- *   MEDIUM  the default: and three rounds of treelet restructuring
- *   HIGH    and triangles split first, 30 % more references: for long, thin or diagonal triangles
- *   BEST    the same as HIGH in this version
+ *   MEDIUM  the default: and three rounds of treelet restructuring, between them the nodes that seem worst placed,
+ *           4 % of all, move to better places
+ *   HIGH    and triangles split first, 20 % more references at most; splits that do not pay are taken back
+ *   BEST    the same with more of everything: five rounds, 25 % of the nodes, 50 % of splits at most; for trees made once
+ *   The paper's own settings: FAST with treelet_rounds 3 and, with splits, split_budget 0.3.
  *
  * WHAT IS PROMISED
  *   Same input, same options: the same tree bit for bit, whatever the number of threads, the compiler, the
@@ -59,7 +61,7 @@
  *   from any thread at once; one tree must not be built from two threads at once.
  *
  * MEMORY
- *   A build takes 81 bytes a triangle of scratch memory (147 with HIGH's 30 % of splits). The tree takes some 36, at
+ *   A build takes 81 bytes a triangle of scratch memory (136 with HIGH's splits, 170 with BEST's). The tree takes some 36, at
  *   most 68, and 48 for its triangles. Who rebuilds often keeps the scratch memory (options.scratch, trbvh_bytes_bound)
  *   and builds into the same tree: then nothing is allocated, and no fresh page touched.
  *
@@ -186,8 +188,8 @@ typedef struct trbvh_jobs {                        /* an engine's job system */
 typedef enum trbvh_quality {
   TRBVH_QUALITY_DEFAULT = 0,   /* = MEDIUM */
   TRBVH_QUALITY_FAST,          /* LBVH + collapse: rebuilt every frame */
-  TRBVH_QUALITY_MEDIUM,        /* + treelet restructuring */
-  TRBVH_QUALITY_HIGH,          /* + triangle splitting, 30 % */
+  TRBVH_QUALITY_MEDIUM,        /* + treelet restructuring and reinsertion */
+  TRBVH_QUALITY_HIGH,          /* + triangle splitting, 20 % */
   TRBVH_QUALITY_BEST           /* offline: everything known that makes rays faster */
 } trbvh_quality;
 enum {
@@ -3152,7 +3154,7 @@ static trbvh_result trb_resolve_geometry(trb_build *b, const trbvh_geometry *geo
 /* The options with the preset's values filled in: afterwards nothing is zero to mean a default. */
 static trbvh_result trb_resolve_options(trb_build *b, const trbvh_options *options) {
   trbvh_options *o = &b->options;
-  int fast, high;
+  int fast, high, best;
   memset(o, 0, sizeof *o);
   if (options) *o = *options;
   if ((unsigned)o->quality > TRBVH_QUALITY_BEST)
@@ -3169,13 +3171,14 @@ static trbvh_result trb_resolve_options(trb_build *b, const trbvh_options *optio
     return trb_fail(b, TRBVH_INVALID_ARGUMENT, "cost_node or cost_prim is above 1000000, or NaN", 0, 0, 0);
   fast = o->quality == TRBVH_QUALITY_FAST;
   high = o->quality >= TRBVH_QUALITY_HIGH;
-  if (o->split_budget == 0 && high) o->split_budget = 0.2f;
+  best = o->quality == TRBVH_QUALITY_BEST;
+  if (o->split_budget == 0 && high) o->split_budget = best ? 0.5f : 0.2f;
   if (o->split_budget < 0 || b->input.boxes) o->split_budget = 0;
-  if (o->treelet_rounds == 0 && !fast) o->treelet_rounds = 3;
+  if (o->treelet_rounds == 0 && !fast) o->treelet_rounds = best ? 5 : 3;
   if (o->treelet_rounds < 0) o->treelet_rounds = 0;
   if (o->treelet_rounds > TRB_ROUNDS_MAX) o->treelet_rounds = TRB_ROUNDS_MAX;
   if (o->treelet_gamma < TRB_TREELET) o->treelet_gamma = TRB_TREELET;
-  if (o->reinsert_share == 0 && !fast) o->reinsert_share = 0.04f;
+  if (o->reinsert_share == 0 && !fast) o->reinsert_share = best ? 0.25f : 0.04f;
   if (o->reinsert_share < 0) o->reinsert_share = 0;
   if (o->unsplit_passes == 0 && high) o->unsplit_passes = 3;
   if (o->unsplit_passes < 0) o->unsplit_passes = 0;

@@ -86,7 +86,7 @@ static void test_every_scene_and_preset(void)
       CHECK_MSG(result == TRBVH_OK, "%s: %s", trbvh_result_text(result), stats.message);
       if (result) continue;
       check_tree(&bvh, &g, &o, preset >= 2, &info);
-      CHECK_MSG(bvh.ref_count <= s.count + (preset >= 2 ? (uint32_t)(0.3 * s.count) : 0u),
+      CHECK_MSG(bvh.ref_count <= s.count + (uint32_t)((double)(preset == 2 ? 0.2f : preset == 3 ? 0.5f : 0) * s.count),
           "%u references of %u triangles", bvh.ref_count, s.count);
       CHECK(bvh.flags == 0 && bvh.prim_count == s.count);
       CHECK_MSG(c.allocs <= 2, "%u allocations", c.allocs);
@@ -257,7 +257,7 @@ static void test_what_presets_mean(void)
     trbvh_geometry g;
     trbvh_options o, fast = preset_options(0), medium = preset_options(1);
     trbvh_options high = preset_options(2), best = preset_options(3);
-    trbvh tree_fast, tree_medium, tree_high;
+    trbvh tree_fast, tree_medium, tree_high, tree_paper;
     if (scene_defs[at].flags & SCENE_BIG) continue;
     scene_make(&s, &scene_defs[at]);
     g = scene_geometry(&s);
@@ -265,30 +265,37 @@ static void test_what_presets_mean(void)
     memset(&tree_fast, 0, sizeof tree_fast);
     memset(&tree_medium, 0, sizeof tree_medium);
     memset(&tree_high, 0, sizeof tree_high);
+    memset(&tree_paper, 0, sizeof tree_paper);
     CHECK(trbvh_build(&tree_fast, &g, &fast) == TRBVH_OK);
     CHECK(trbvh_build(&tree_medium, &g, &medium) == TRBVH_OK);
     CHECK(trbvh_build(&tree_high, &g, &high) == TRBVH_OK);
     CHECK_MSG(same_build(&tree_medium, &g, NULL), "no options = MEDIUM");
     memset(&o, 0, sizeof o);
     CHECK_MSG(same_build(&tree_medium, &g, &o), "zeroed options = MEDIUM");
-    CHECK_MSG(same_build(&tree_high, &g, &best), "BEST = HIGH");
-    o = fast; o.treelet_rounds = 3;
-    CHECK_MSG(same_build(&tree_medium, &g, &o), "FAST and three rounds = MEDIUM");
-    o.split_budget = 0.3f;
-    CHECK_MSG(same_build(&tree_high, &g, &o), "FAST, three rounds, 30 %% = HIGH");
+    o = fast; o.treelet_rounds = 3; o.treelet_gamma = 7; o.reinsert_share = 0.04f;
+    CHECK_MSG(same_build(&tree_medium, &g, &o), "FAST, three rounds and reinsertion = MEDIUM");
+    o.split_budget = 0.2f; o.unsplit_passes = 3;
+    CHECK_MSG(same_build(&tree_high, &g, &o), "and splits, and three passes to take them back = HIGH");
     o = medium; o.treelet_rounds = -1;
     CHECK_MSG(same_build(&tree_fast, &g, &o), "MEDIUM without rounds = FAST");
-    o = medium; o.split_budget = 0.3f;
-    CHECK_MSG(same_build(&tree_high, &g, &o), "MEDIUM and 30 %% = HIGH");
+    o = medium; o.split_budget = 0.2f; o.unsplit_passes = 3;
+    CHECK_MSG(same_build(&tree_high, &g, &o), "MEDIUM and splits = HIGH");
     o = high; o.split_budget = -1;
     CHECK_MSG(same_build(&tree_medium, &g, &o), "HIGH without splits = MEDIUM");
+    o = best; o.treelet_rounds = 3; o.reinsert_share = 0.04f; o.split_budget = 0.2f;
+    CHECK_MSG(same_build(&tree_high, &g, &o), "BEST with HIGH's settings = HIGH");
+    o = medium; o.reinsert_share = -1;
+    CHECK(trbvh_build(&tree_paper, &g, &o) == TRBVH_OK);
+    o = fast; o.treelet_rounds = 3;
+    CHECK_MSG(same_build(&tree_paper, &g, &o), "MEDIUM without reinsertion = the paper's");
     o = high; o.max_leaf = 8; o.cost_node = 1.2f; o.cost_prim = 1.0f;
     CHECK_MSG(same_build(&tree_high, &g, &o), "defaults spelled out");
     if (s.count > 1000 && (scene_defs[at].flags & SCENE_ORDINARY)) {
       CHECK_MSG(!same_tree(&tree_fast, &tree_medium), "the rounds do something");
       if (strcmp(s.name, "room")) CHECK_MSG(!same_tree(&tree_high, &tree_medium), "the splits do something");
     }
-    trbvh_free(&tree_fast); trbvh_free(&tree_medium); trbvh_free(&tree_high);
+    trbvh_free(&tree_fast); trbvh_free(&tree_medium); trbvh_free(&tree_paper);
+    trbvh_free(&tree_high);
     scene_free(&s);
   }
 }

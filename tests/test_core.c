@@ -1202,8 +1202,7 @@ static void test_depth_bound(void) {
             b.nodes[2 * i + 1 - left] = rest;
           }
           b.nodes[0] = trb_parent(b.nodes[2], b.nodes[3], 2, b.costs);
-          trb_start_phase(&b, 0);
-          CHECK(trb_restructure_and_settle(&b) == TRBVH_OK);
+          CHECK(trb_run_phases(&b, 1, 0) == TRBVH_OK);
           CHECK(trb_emit(&b, &bvh) == TRBVH_OK && trb_finish(&b) == TRBVH_OK);
           trb_hand_over(&b, &bvh, n);
           CHECK_MSG(trbvh_validate(&bvh, &g, why, sizeof why) == TRBVH_OK, "%s", why);
