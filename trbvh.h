@@ -217,7 +217,7 @@ typedef struct trbvh_options {
                                             at most 0.25. Rounds then go from large subtrees to small ones: those of
                                             gamma * 4^(rounds - 1 - r) references or more in round r; none (negative):
                                             gamma * 2^r, which is the paper's */
-  int32_t         unsplit_passes;        /* over all splits before each round, to take back those that do not pay */
+  int32_t         unsplit_passes;        /* over all splits before each round, to take back those that do not pay; at most 16 */
 } trbvh_options;
 struct trbvh_stats {
   double   ms_total, ms_split, ms_morton, ms_sort, ms_hierarchy, ms_treelets, ms_collapse, ms_finish, ms_transfer;   /* with treelets, leaves are chosen in ms_treelets */
@@ -3056,6 +3056,7 @@ static double trb_ms(void) {
 // >>input ---- arguments made explicit and checked, references made -----------------------------
 #define TRB_REFS_MAX   0x7FFFFFFFu       /* node indices are twice that */
 #define TRB_ROUNDS_MAX 28                /* of treelets: the last one's gamma is more than any tree has references */
+#define TRB_UNSPLITS_MAX 16              /* passes; later ones find nothing */
 #define TRB_NODE_BYTES sizeof(trbvh_node)
 
 #define TRB_READ_BLOCK 4096u             /* primitives a job reads, or makes triangles of */
@@ -3096,6 +3097,7 @@ typedef struct trb_build {
   struct { uint32_t gamma, rounds, last; } phase;    /* of treelets */
   uint32_t              slot_count;      /* of refs, gaps among them */
   uint32_t              lowest_score, move_count, batch;
+  float                 moves_share;     /* of the call's time: one batch of moves */
   /* parameters of the jobs at work */
   float                 priority_unit;
   trb_u64               scale;
@@ -3182,6 +3184,7 @@ static trbvh_result trb_resolve_options(trb_build *b, const trbvh_options *optio
   if (o->reinsert_share < 0) o->reinsert_share = 0;
   if (o->unsplit_passes == 0 && high) o->unsplit_passes = 3;
   if (o->unsplit_passes < 0) o->unsplit_passes = 0;
+  if (o->unsplit_passes > TRB_UNSPLITS_MAX) o->unsplit_passes = TRB_UNSPLITS_MAX;
   if (o->max_leaf == 0) o->max_leaf = 8;
   if (o->max_leaf > TRB_MAX_LEAF) o->max_leaf = TRB_MAX_LEAF;
   if (o->cost_node == 0) o->cost_node = 1.2f;
@@ -3685,6 +3688,11 @@ static trb_mover trb_build_mover(const trb_build *b) {
   return trb_start_moves(b->nodes, b->refs, trb_split_words(b->keys, b->sorted, b->ref_max), b->costs);
 }
 
+/* Runs jobs as one of the moves' many small stages. */
+static int trb_run_moves(trb_build *b, uint32_t count, trbvh_job *job) {
+  return trb_stage(&b->runner, b->moves_share) || trb_run(&b->runner, count, job, b);
+}
+
 /* Blocks of pairs, which are numbered from 0, the root's, to the number of references. */
 static uint32_t trb_pair_blocks(const trb_build *b) { return trb_blocks(b->ref_count, TRB_BLOCK); }
 
@@ -3720,18 +3728,18 @@ static int trb_find_candidates(trb_build *b, uint32_t wanted) {
   const uint32_t blocks = trb_pair_blocks(b);
   uint32_t *histogram = b->histograms, *parents = trb_build_mover(b).parents, block, i, count;
   parents[0] = parents[b->nodes[0].first / 2] = 0;
-  if (trb_run(&b->runner, blocks, trb_score_job, b)) return 1;
+  if (trb_run_moves(b, blocks, trb_score_job)) return 1;
   for (block = 1; block < blocks; block++)
     for (i = 0; i < TRB_SCORES; i++) histogram[i] += histogram[(size_t)block * TRB_SCORES + i];
   b->lowest_score = trb_lowest_score(histogram, wanted);
-  if (trb_run(&b->runner, blocks, trb_count_candidates_job, b)) return 1;
+  if (trb_run_moves(b, blocks, trb_count_candidates_job)) return 1;
   for (block = b->move_count = 0; block < blocks; block++) {
     count = histogram[block];
     histogram[block] = b->move_count;
     b->move_count += count;
   }
   b->move_count = TRB_MIN(b->move_count, TRB_MOVES_MAX(b->ref_count));
-  return trb_run(&b->runner, blocks, trb_list_candidates_job, b);
+  return trb_run_moves(b, blocks, trb_list_candidates_job);
 }
 
 static void trb_search_job(void *context, uint32_t index) {
@@ -3752,7 +3760,7 @@ static int trb_reinsert_candidates(trb_build *b) {
   if (trb_find_candidates(b, wanted)) return 1;
   memset(m.owners, 0xFF, (size_t)b->ref_count * sizeof *m.owners);
   for (b->batch = 0; b->batch <= TRB_MOVE_BATCHES; b->batch++) {
-    if (trb_run(&b->runner, trb_blocks(b->move_count, TRB_SEARCHES), trb_search_job, b)) return 1;
+    if (trb_run_moves(b, trb_blocks(b->move_count, TRB_SEARCHES), trb_search_job)) return 1;
     trb_choose_moves(&m, b->move_count);
     for (i = 0; i < b->move_count; i++)
       if (m.moves[i].gain > 0) trb_reinsert(&m, &m.moves[i]);
@@ -3785,13 +3793,13 @@ static int trb_unsplit(trb_build *b) {
   const trb_mover m = trb_build_mover(b);
   int32_t pass;
   uint32_t i;
-  if (!b->refs || trb_run(&b->runner, trb_blocks(b->slot_count, TRB_BLOCK), trb_forget_refs_job, b) ||
-      trb_run(&b->runner, trb_pair_blocks(b), trb_find_refs_job, b)) return b->runner.cancelled;
+  if (!b->refs || trb_run_moves(b, trb_blocks(b->slot_count, TRB_BLOCK), trb_forget_refs_job) ||
+      trb_run_moves(b, trb_pair_blocks(b), trb_find_refs_job)) return b->runner.cancelled;
   memset(m.owners, 0xFF, (size_t)b->ref_count * sizeof *m.owners);
   b->move_count = TRB_MOVES_MAX(b->slot_count);
   for (pass = 0; pass < b->options.unsplit_passes; pass++)
     for (b->batch = 0; b->batch < TRB_MOVE_BATCHES; b->batch++) {
-      if (trb_run(&b->runner, trb_blocks(b->move_count, TRB_SEARCHES), trb_search_merges_job, b)) return 1;
+      if (trb_run_moves(b, trb_blocks(b->move_count, TRB_SEARCHES), trb_search_merges_job)) return 1;
       trb_choose_moves(&m, b->move_count);
       for (i = 0; i < b->move_count; i++)
         if (m.moves[i].gain > 0) trb_merge(&m, &m.moves[i]);
@@ -3970,16 +3978,15 @@ static void trb_start_phase(trb_build *b, uint32_t phase) {
 
 static trbvh_result trb_run_phases(trb_build *b, float share, float settling) {
   const uint32_t phases = trb_phases(b);
+  const uint32_t unsplits = b->split_max ? (uint32_t)b->options.unsplit_passes : 0;
   const float part = share / (float)phases;
   trbvh_result result = TRBVH_OK;
   uint32_t phase;
   for (phase = 0; phase < phases; phase++) {
     trb_start_phase(b, phase);
-    if (b->split_max && b->options.unsplit_passes) {
-      TRB_STAGE(part * 0.25f, ms_moves, trb_unsplit(b) || trb_reinsert_candidates(b) ? TRBVH_CANCELLED : TRBVH_OK)
-    } else if (phase) {
-      TRB_STAGE(part * 0.25f, ms_moves, trb_reinsert_candidates(b) ? TRBVH_CANCELLED : TRBVH_OK)
-    }
+    b->moves_share = part * 0.25f / (float)((unsplits + 1) * TRB_MOVE_BATCHES + 6);
+    if (unsplits) { TRB_STAGE(0, ms_moves, trb_unsplit(b) ? TRBVH_CANCELLED : TRBVH_OK) }
+    if (unsplits || phase) { TRB_STAGE(0, ms_moves, trb_reinsert_candidates(b) ? TRBVH_CANCELLED : TRBVH_OK) }
     if (b->phase.rounds) { TRB_STAGE(phase ? part * 0.75f : part, ms_treelets, trb_restructure_and_settle(b)) }
     else { TRB_STAGE(settling, ms_collapse, trb_restructure_and_settle(b)) }
   }

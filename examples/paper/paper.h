@@ -221,7 +221,6 @@ static inline trbvh_result paper_make(trbvh *bvh, const trbvh_geometry *geometry
   trb_runner_start(&b->runner, &b->options, 1);
   if (!result && b->input.count) result = trb_allocate_scratch(b);
   if (!result && b->input.count) result = trb_read(b);
-  b->refs = NULL;                      /* its leaves hold primitives, not references */
   if (!result && b->ref_count) {
     p.ref_max = b->ref_max;
     p.refs = (trbvh_node *)ex_allocate(p.ref_max, sizeof *p.refs);
@@ -231,6 +230,7 @@ static inline trbvh_result paper_make(trbvh *bvh, const trbvh_geometry *geometry
     paper_read_refs(&p);
     if (p.ref_count == 1) p.nodes[0] = p.refs[0];
     else builder(&p);
+    for (uint32_t i = 0; b->refs && i < b->input.count; i++) b->refs[i].first = i;     /* leaves hold primitives here */
     b->ref_count = p.ref_count;
     b->stats.ms_hierarchy = ex_now_ms() - start;
     trb_start_phase(b, 0);
