@@ -177,6 +177,7 @@ static inline uint32_t paper_climb(paper_build *p, const uint64_t *codes, paper_
 static inline void paper_lbvh(paper_build *p)
 {
   trb_build *b = &p->lib;
+  trbvh_node *own_refs = b->refs;
   uint32_t per_block = trb_blocks(p->ref_count, b->block_count), start = 0;
   b->refs = p->refs;
   b->ref_count = p->ref_count;
@@ -190,6 +191,9 @@ static inline void paper_lbvh(paper_build *p)
   trb_make_keys(b);
   trb_sort_keys(b);
   trb_build_hierarchy(b);
+  for (uint32_t i = 0; i < 2 * p->ref_count; i++)    /* the library's leaves hold references, ours primitives */
+    if (i != 1 && trb_is_single(p->nodes[i].count)) p->nodes[i].first = p->refs[p->nodes[i].first].first;
+  b->refs = own_refs;
   p->pair_end = p->ref_count;
 }
 
