@@ -1768,30 +1768,6 @@ TRB_CORE trbvh_node trb_join(trbvh_node a, trbvh_node b) {
   return a;
 }
 
-/* Areas of a pair's nodes, each joined with another node, and by itself. */
-typedef struct trb_areas { float joint[2], own[2]; } trb_areas;
-
-TRB_CORE trb_areas trb_pair_areas(const TRB_GLOBAL trbvh_node *pair, trbvh_node n) {
-  trb_areas areas;
-#if defined(TRB_X86)                     /* the same operations, four areas at a time */
-  const __m128 low = _mm_loadu_ps(n.min), low0 = _mm_loadu_ps(pair[0].min), low1 = _mm_loadu_ps(pair[1].min);
-  const __m128 high = _mm_loadu_ps(n.max), high0 = _mm_loadu_ps(pair[0].max), high1 = _mm_loadu_ps(pair[1].max);
-  const __m128 joint0 = _mm_sub_ps(_mm_max_ps(high0, high), _mm_min_ps(low0, low)), own0 = _mm_sub_ps(high0, low0);
-  const __m128 joint1 = _mm_sub_ps(_mm_max_ps(high1, high), _mm_min_ps(low1, low)), own1 = _mm_sub_ps(high1, low1);
-  const __m128 joint_xy = _mm_unpacklo_ps(joint0, joint1), own_xy = _mm_unpacklo_ps(own0, own1);
-  const __m128 x = _mm_movelh_ps(joint_xy, own_xy), y = _mm_movehl_ps(own_xy, joint_xy);
-  const __m128 z = _mm_movelh_ps(_mm_unpackhi_ps(joint0, joint1), _mm_unpackhi_ps(own0, own1));
-  const __m128 area = _mm_add_ps(_mm_mul_ps(x, y), _mm_mul_ps(z, _mm_add_ps(x, y)));
-  _mm_storeu_ps(areas.joint, _mm_min_ps(area, _mm_set1_ps(FLT_MAX)));
-#else
-  areas.joint[0] = trb_area(trb_join(pair[0], n));
-  areas.joint[1] = trb_area(trb_join(pair[1], n));
-  areas.own[0] = trb_area(pair[0]);
-  areas.own[1] = trb_area(pair[1]);
-#endif
-  return areas;
-}
-
 // ---- Conflicts ----
 TRB_CORE void trb_touched_pairs(const trb_mover *m, trb_move move, trbvh_u32 pairs[3]) {
   pairs[0] = move.node / 2;
@@ -1980,15 +1956,15 @@ TRB_SHARED trb_move trb_find_place(const trb_mover *m, trbvh_u32 node, float lea
     while (waiting && steps) {
       const float above = stack[--waiting].rest;
       const trbvh_u32 pair = stack[waiting].pair;
-      trb_areas areas;
       float below[2];
       if (!(above - area > best.gain)) continue;
       steps--;
-      areas = trb_pair_areas(&m->nodes[pair], n);
       for (side = 0; side < 2; side++) {
-        below[side] = trb_is_leaf(m->nodes[pair + side].count) ? 0 : above - areas.joint[side] + areas.own[side];
-        if (above - areas.joint[side] > best.gain) {
-          best.gain = above - areas.joint[side];
+        const trbvh_node child = m->nodes[pair + side];
+        const float both = trb_area(trb_join(child, n));
+        below[side] = trb_is_leaf(child.count) ? 0 : above - both + trb_area(child);
+        if (above - both > best.gain) {
+          best.gain = above - both;
           best.target = pair + side;
           best.above = pivot;
         }
@@ -2020,15 +1996,6 @@ TRB_SHARED trb_move trb_find_place(const trb_mover *m, trbvh_u32 node, float lea
   }
   if (!best.target) best.gain = 0;
   return best;
-}
-
-/* Asks for what a search begins with. */
-TRB_CORE void trb_prefetch_above(const trb_mover *m, trbvh_u32 node) {
-  trbvh_u32 k;
-  for (k = 0; k < 4; k++) {
-    TRB_PREFETCH(&m->nodes[node]);
-    node = m->parents[node / 2];
-  }
 }
 
 /* Candidate i in a batch. The root's children have no other place. */
@@ -3746,10 +3713,7 @@ static void trb_search_job(void *context, uint32_t index) {
   trb_build *b = (trb_build *)context;
   const trb_mover m = trb_build_mover(b);
   uint32_t i = index * TRB_SEARCHES, end = TRB_MIN(b->move_count, i + TRB_SEARCHES);
-  for (; i < end; i++) {
-    if (i + 2 * TRB_MOVE_BATCHES < end) trb_prefetch_above(&m, m.moves[i + 2 * TRB_MOVE_BATCHES].node);
-    trb_search(&m, i, b->batch, trb_least_gain(b->lowest_score));
-  }
+  for (; i < end; i++) trb_search(&m, i, b->batch, trb_least_gain(b->lowest_score));
 }
 
 /* The last batch is for those that had to stand back in the one before. */
