@@ -74,6 +74,7 @@ static void test_lbvh_is_the_library_s(void)
   paper_tree t = paper_test_make(&g, paper_lbvh, NULL, 0, 0), r = paper_test_make(&g, paper_lbvh, NULL, 0, 3);
   trbvh_options o;
   memset(&o, 0, sizeof o);
+  o.reinsert_share = -1;
   for (int quality = TRBVH_QUALITY_FAST; quality <= TRBVH_QUALITY_MEDIUM; ++quality) {
     trbvh want = {0};
     o.quality = (trbvh_quality)quality;

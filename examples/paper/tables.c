@@ -56,7 +56,7 @@ typedef struct builder {
   paper_builder *make;                 /* NULL: trbvh_build */
   const void *parameters;
   int quality, rounds;
-  float splits;                        /* references more, as a share of the triangles; below 0: none */
+  float splits;                        /* references more, as a share of the triangles; 0: the preset's; below 0: none */
   double expected;                     /* ns a triangle, for the time that is left */
   double paper[2][FIGURES];            /* by table; 0: not known, or not in it */
 } builder;
@@ -72,8 +72,10 @@ static const paper_embree_parameters embree_high = {&peer, RTC_BUILD_QUALITY_HIG
 static const builder builders[] = {
   {"SweepSAH", "sweep", FIRST_TABLE, paper_sweep, NULL, 0, 0, -1, 700, {{100, 100, 100}, {0}}},
   {"SBVH", "sbvh", SECOND_TABLE, paper_sbvh, NULL, 0, 0, 2, 5000, {{0}, {100, 100, 100}}},
-  {"TRBVH", "trbvh", FIRST_TABLE | SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, -1, 200,
+  {"TRBVH", "trbvh", FIRST_TABLE | SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_FAST, 3, -1, 200,
    {{96.0, 94.4, 1.03}, {76.5, 111.5, 0.14}}},
+  {"trbvh MEDIUM", "medium", FIRST_TABLE | SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, -1, 250, {{0}, {0}}},
+  {"BEST, no splits", "best-whole", FIRST_TABLE, NULL, NULL, TRBVH_QUALITY_BEST, 0, -1, 1000, {{0}, {0}}},
   {"LBVH", "lbvh", FIRST_TABLE, NULL, NULL, TRBVH_QUALITY_FAST, 0, -1, 60, {{69.4, 131.5, 0.28}, {0}}},
   {"HLBVH", "hlbvh", FIRST_TABLE, paper_hlbvh, NULL, 0, 0, -1, 250, {{67.4, 129.3, 0.57}, {0}}},
   {"GridSAH", "grid", FIRST_TABLE, paper_grid, NULL, 0, 0, -1, 400, {{68.1, 129.1, 0.70}, {0}}},
@@ -88,13 +90,15 @@ static const builder builders[] = {
   {"Embree LOW", "embree-low", FIRST_TABLE, paper_embree, &embree_low, 0, 0, -1, 200, {{0}, {0}}},
   {"Embree MEDIUM", "embree-medium", FIRST_TABLE, paper_embree, &embree_medium, 0, 0, -1, 600, {{0}, {0}}},
 #endif
-  {"TRBVH, 10 % splits", "trbvh-10", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, 0.1f, 300,
+  {"trbvh HIGH", "high", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_HIGH, 0, 0, 1000, {{0}, {0}}},
+  {"trbvh BEST", "best", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_BEST, 0, 0, 4000, {{0}, {0}}},
+  {"TRBVH, 10 % splits", "trbvh-10", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_FAST, 3, 0.1f, 300,
    {{0}, {87.2, 108.8, 0.15}}},
-  {"TRBVH, 30 %", "trbvh-30", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, 0.3f, 350,
+  {"TRBVH, 30 %", "trbvh-30", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_FAST, 3, 0.3f, 350,
    {{0}, {91.0, 108.0, 0.17}}},
-  {"TRBVH, 50 %", "trbvh-50", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, 0.5f, 400,
+  {"TRBVH, 50 %", "trbvh-50", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_FAST, 3, 0.5f, 400,
    {{0}, {92.5, 108.3, 0.20}}},
-  {"TRBVH, as SBVH", "trbvh-match", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_MEDIUM, 0, MATCH_SBVH, 400,
+  {"TRBVH, as SBVH", "trbvh-match", SECOND_TABLE, NULL, NULL, TRBVH_QUALITY_FAST, 3, MATCH_SBVH, 400,
    {{0}, {90.7, 107.4, 0.16}}},
   {"ESC, as SBVH", "esc", SECOND_TABLE, paper_esc, NULL, 0, 3, MATCH_SBVH, 1500, {{0}, {0}}},
   {"EVH, as SBVH", "evh", SECOND_TABLE, paper_evh, NULL, 0, 3, MATCH_SBVH, 1500, {{0}, {0}}},
@@ -625,8 +629,8 @@ static void print_rays(FILE *out, double rays)
 static void print_break_even(FILE *out, const tables *t)
 {
   static const char *const pairs[][2] = {
-    {"lbvh", "trbvh"}, {"trbvh", "sweep"}, {"trbvh", "bittner"}, {"trbvh", "trbvh-30"}, {"trbvh-30", "sbvh"},
-    {"trbvh", "sbvh"}
+    {"lbvh", "trbvh"}, {"trbvh", "medium"}, {"medium", "high"}, {"high", "best"}, {"medium", "sweep"},
+    {"medium", "bittner"}, {"high", "sbvh"}
   };
   double *at = (double *)ex_allocate(t->inputs.count, sizeof *at);
   fputs("\n### From how many rays on a slower build pays, one thread\n\n| | median of the scenes | first | last |\n"
@@ -794,7 +798,7 @@ static void plot_builders(const tables *t, const char *name, measure *of, const 
 /* The builders that diagrams with many lines or bars show. */
 static int shown_rows(const tables *t, int rows[BUILDERS])
 {
-  static const char *const keys[] = {"lbvh", "ploc", "trbvh", "bittner", "sweep", "trbvh-30", "sbvh"};
+  static const char *const keys[] = {"lbvh", "trbvh", "medium", "bittner", "sweep", "high", "sbvh"};
   int count = 0;
   for (size_t k = 0; k < sizeof keys / sizeof *keys; k++) {
     int row = row_of(keys[k]);
