@@ -3149,7 +3149,7 @@ static trbvh_result trb_resolve_options(trb_build *b, const trbvh_options *optio
   if (o->treelet_gamma < TRB_TREELET) o->treelet_gamma = TRB_TREELET;
   if (o->reinsert_share == 0 && !fast) o->reinsert_share = best ? 0.25f : 0.04f;
   if (o->reinsert_share < 0) o->reinsert_share = 0;
-  if (o->unsplit_passes == 0 && high) o->unsplit_passes = 3;
+  if (o->unsplit_passes == 0 && high) o->unsplit_passes = best ? 3 : 2;
   if (o->unsplit_passes < 0) o->unsplit_passes = 0;
   if (o->unsplit_passes > TRB_UNSPLITS_MAX) o->unsplit_passes = TRB_UNSPLITS_MAX;
   if (o->max_leaf == 0) o->max_leaf = 8;
