@@ -1890,6 +1890,7 @@ TRB_SHARED void trb_remake_moved(const trb_mover *m, trbvh_u32 count) {
 #define TRB_SCORES       2048u           /* buckets, by exponent and three bits more: two scores to a word */
 #define TRB_SCORE_SHIFT  20
 #define TRB_SEARCH_STEPS 64u             /* pairs looked at in one search, at most; and so many wait */
+#define TRB_SEARCHES     256u            /* candidates that a job looks at */
 
 TRB_CORE trbvh_u32 trb_score(float above, float area, float both) {
   const float tame = TRB_MIN(both, 1 / TRB_TINY), ratio = above * trb_reciprocal(TRB_MAX(tame, TRB_TINY));
@@ -2714,7 +2715,7 @@ TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbv
 #define TRB_GPU_TILE    2048u            /* ... and elements in a row that it takes, where order matters */
 #define TRB_GPU_CHUNK   1024u            /* leaves over which one group builds the hierarchy ... */
 #define TRB_GPU_CHUNKS  16u              /* ... and so many chunks that the next one joins */
-#define TRB_GPU_LEVELS  128u             /* more than any tree has; they are listed one by one on a GPU */
+#define TRB_GPU_LEVELS  1024u            /* they are listed one by one on a GPU; deeper trees, which moves could make, are left to C */
 #define TRB_ROOTS_MAX   (1u << 20)       /* treelets of one launch: none lasts longer than a watchdog's patience */
 #define TRB_CPU_RAYS    64u              /* that a work-item of a CPU traces */
 #define TRB_JOB_STEP    64u              /* every so many-th work-group of a CPU gets a heavy job */
@@ -2727,13 +2728,16 @@ typedef struct trb_plan {
   trb_costs    costs;
   trb_key_form form;
   float        cost_node, cost_prim;
-  trbvh_u32    prim_count, position_count, index_size, boxes, split_max;
+  trbvh_u32    prim_count, position_count, index_size, boxes, split_max, ref_max;
+  float        reinsert_share;
   /* found out */
   trb_grid     grid;
   float        priority_unit;
   float        sah, root_area;           /* equation 1's sum, with half areas, not yet divided by the root's */
   trbvh_u32    scale_low, slots, ref_count;                      /* slots: references and gaps between them */
   trbvh_u32    skipped, bad, bad_vertex; /* primitives; the first with an index out of range (TRBVH_NONE: none), and it */
+  trbvh_u32    lowest_score, moves;      /* that are looked at */
+  trbvh_u32    too_deep;                 /* not 0: the tree has more levels than TRB_GPU_LEVELS */
   trbvh_u32    groups, tasks, leaves, prims, max_depth;
 } trb_plan;
 
@@ -3027,7 +3031,6 @@ static double trb_ms(void) {
 #define TRB_NODE_BYTES sizeof(trbvh_node)
 
 #define TRB_READ_BLOCK 4096u             /* primitives a job reads, or makes triangles of */
-#define TRB_SEARCHES   256u              /* candidates for a move that a job looks at */
 
 /* What one block of primitives came to. */
 typedef struct trb_block {

@@ -117,7 +117,7 @@ TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines);
 
 // >>kernels begin ---- made by kernels/embed.c from trbvh.h and kernels/*.cl: do not edit ---------------------------
 static const char *const trb_cl_text[] = {
-  "#line 83 \"trbvh.h\"\n",
+  "#line 85 \"trbvh.h\"\n",
   "#define TRBVH_VERSION_MAJOR 0\n",
   "#define TRBVH_VERSION_MINOR 1\n",
   "#define TRBVH_VERSION_PATCH 0\n",
@@ -127,7 +127,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "  #define TRBVH_OPENCL_C 1\n",
   "  typedef uint trbvh_u32;\n",
-  "#line 97 \"trbvh.h\"\n",
+  "#line 99 \"trbvh.h\"\n",
   "#define TRBVH_NONE      0xFFFFFFFFu\n",
   "#define TRBVH_MAX_DEPTH 64\n",
   "\n",
@@ -153,9 +153,9 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "typedef struct trbvh_hit { float t, u, v; trbvh_u32 prim; trbvh_u32 instance; } trbvh_hit;\n",
-  "#line 268 \"trbvh.h\"\n",
+  "#line 277 \"trbvh.h\"\n",
   "  #pragma OPENCL FP_CONTRACT OFF\n",
-  "#line 279 \"trbvh.h\"\n",
+  "#line 288 \"trbvh.h\"\n",
   "  #ifdef TRB_OUTLINE\n",
   "    #define TRB_CORE static inline __attribute__((unused))\n",
   "  #else\n",
@@ -174,11 +174,11 @@ static const char *const trb_cl_text[] = {
   "  #endif\n",
   "  #define trb_bits(x)  as_uint(x)\n",
   "  #define trb_float(x) as_float(x)\n",
-  "#line 319 \"trbvh.h\"\n",
+  "#line 328 \"trbvh.h\"\n",
   "#ifndef TRB_PREFETCH\n",
   "  #define TRB_PREFETCH(address) ((void)(address))\n",
   "#endif\n",
-  "#line 378 \"trbvh.h\"\n",
+  "#line 387 \"trbvh.h\"\n",
   "#ifndef TRBVH_ASSERT\n",
   "  #define TRBVH_ASSERT(x) ((void)0)\n",
   "#endif\n",
@@ -186,19 +186,22 @@ static const char *const trb_cl_text[] = {
   "\n",
   "    #define TRB_REAL float\n",
   "    #define TRB_NOISE 9.5367432e-7f\n",
-  "#line 389 \"trbvh.h\"\n",
+  "#line 398 \"trbvh.h\"\n",
   "#endif\n",
   "\n",
   "  #define TRB_ALIGNED(type) type __attribute__((aligned(64)))\n",
-  "#line 397 \"trbvh.h\"\n",
+  "#line 406 \"trbvh.h\"\n",
   "#if defined(__cplusplus) || defined(_MSC_VER)\n",
   "  #define TRB_RESTRICT __restrict\n",
   "#else\n",
   "  #define TRB_RESTRICT restrict\n",
   "#endif\n",
-  "#line 412 \"trbvh.h\"\n",
+  "#line 421 \"trbvh.h\"\n",
   "#define TRB_MIN(a, b) ((a) < (b) ? (a) : (b))\n",
   "#define TRB_MAX(a, b) ((a) > (b) ? (a) : (b))\n",
+  "\n",
+  "\n",
+  "#define TRB_PLUS_ZERO 0.0f\n",
   "\n",
   "TRB_CORE float trb_abs(float x) { return x < 0 ? -x : x; }\n",
   "TRB_CORE int   trb_finite(float x) { return (trb_bits(x) & 0x7F800000u) != 0x7F800000u; }\n",
@@ -230,7 +233,7 @@ static const char *const trb_cl_text[] = {
   "  for (i = 0; i < 4; i++) r = r * (4.0f - x * r * r * r) * 0.333333343f;\n",
   "  return x * r * r;\n",
   "}\n",
-  "#line 455 \"trbvh.h\"\n",
+  "#line 467 \"trbvh.h\"\n",
   "#define TRB_MAX_LEAF 16u\n",
   "#define TRB_SMALL    0x80000000u\n",
   "#define TRB_LEAF     0x40000000u\n",
@@ -310,7 +313,7 @@ static const char *const trb_cl_text[] = {
   "  return trb_morton(0.5f * box.min[0] + 0.5f * box.max[0], 0.5f * box.min[1] + 0.5f * box.max[1],\n",
   "                    0.5f * box.min[2] + 0.5f * box.max[2], grid);\n",
   "}\n",
-  "#line 547 \"trbvh.h\"\n",
+  "#line 559 \"trbvh.h\"\n",
   "#define TRB_TREELET 7\n",
   "#define TRB_GPU_LANES 32u\n",
   "#if defined(TRB_GPU)\n",
@@ -357,7 +360,7 @@ static const char *const trb_cl_text[] = {
   "  1 << TRB_SKIP(1, without), 1 << TRB_SKIP(2, without), 1 << TRB_SKIP(3, without), 1 << TRB_SKIP(4, without), \\\n",
   "  1 << TRB_SKIP(5, without)))\n",
   "#define TRB_SKIP(i, without) ((i) + ((i) >= (without)))\n",
-  "#line 597 \"trbvh.h\"\n",
+  "#line 609 \"trbvh.h\"\n",
   "#define TRB_DEFINE_TREELET_COSTS(function) \\\n",
   "  function(const TRB_WORK float *TRB_RESTRICT leaves, TRB_WORK float *TRB_RESTRICT table, float *TRB_RESTRICT sums, \\\n",
   "           trb_costs costs) { \\\n",
@@ -433,7 +436,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "TRB_CORE int trb_improves(float cost, float old_cost) { return cost < old_cost - old_cost * 3.8147e-6f; }\n",
-  "#line 677 \"trbvh.h\"\n",
+  "#line 689 \"trbvh.h\"\n",
   "typedef struct trb_plane { int axis, level; float position; } trb_plane;\n",
   "#define TRB_TINY 1e-30f\n",
   "\n",
@@ -523,7 +526,7 @@ static const char *const trb_cl_text[] = {
   "    for (j = 0; j < 3; j++) polygon[i][j] = kept[i][j];\n",
   "  return count;\n",
   "}\n",
-  "#line 771 \"trbvh.h\"\n",
+  "#line 783 \"trbvh.h\"\n",
   "TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {\n",
   "  float polygon[TRB_POLYGON][3], pad[3];\n",
   "  trbvh_node bounds = *box;\n",
@@ -545,14 +548,14 @@ static const char *const trb_cl_text[] = {
   "    }\n",
   "    low -= 0.5f * pad[k];\n",
   "    high += 0.5f * pad[k];\n",
-  "    bounds.min[k] = TRB_MAX(low, box->min[k]);\n",
-  "    bounds.max[k] = TRB_MIN(high, box->max[k]);\n",
+  "    bounds.min[k] = TRB_MAX(low, box->min[k]) + TRB_PLUS_ZERO;\n",
+  "    bounds.max[k] = TRB_MIN(high, box->max[k]) + TRB_PLUS_ZERO;\n",
   "    if (!(bounds.min[k] <= bounds.max[k])) return 0;\n",
   "  }\n",
   "  *box = bounds;\n",
   "  return 1;\n",
   "}\n",
-  "#line 803 \"trbvh.h\"\n",
+  "#line 815 \"trbvh.h\"\n",
   "  typedef struct trb_mesh {\n",
   "    const __global char *positions, *indices, *boxes;\n",
   "    ulong position_stride, box_stride;\n",
@@ -567,7 +570,7 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE float trb_load_float(const TRB_GLOBAL char *p) {\n",
   "\n",
   "  return *(const __global float *)p;\n",
-  "#line 825 \"trbvh.h\"\n",
+  "#line 837 \"trbvh.h\"\n",
   "}\n",
   "\n",
   "TRB_CORE void trb_load_position(float out[3], const TRB_GLOBAL char *p) {\n",
@@ -579,13 +582,13 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE trbvh_u32 trb_index16(const trb_mesh *mesh, size_t i) {\n",
   "\n",
   "  return ((const __global ushort *)mesh->indices)[i];\n",
-  "#line 841 \"trbvh.h\"\n",
+  "#line 853 \"trbvh.h\"\n",
   "}\n",
   "\n",
   "TRB_CORE trbvh_u32 trb_index32(const trb_mesh *mesh, size_t i) {\n",
   "\n",
   "  return ((const __global uint *)mesh->indices)[i];\n",
-  "#line 851 \"trbvh.h\"\n",
+  "#line 863 \"trbvh.h\"\n",
   "}\n",
   "\n",
   "TRB_CORE trbvh_u32 trb_index(const trb_mesh *mesh, size_t i) {\n",
@@ -648,8 +651,8 @@ static const char *const trb_cl_text[] = {
   "  int k, finite = 1;\n",
   "  for (k = 0; k < 3; k++) {\n",
   "    float low = TRB_MIN(v[0][k], v[1][k]), high = TRB_MAX(v[0][k], v[1][k]);\n",
-  "    box->min[k] = TRB_MIN(v[2][k], low);\n",
-  "    box->max[k] = TRB_MAX(v[2][k], high);\n",
+  "    box->min[k] = TRB_MIN(v[2][k], low) + TRB_PLUS_ZERO;\n",
+  "    box->max[k] = TRB_MAX(v[2][k], high) + TRB_PLUS_ZERO;\n",
   "    finite &= trb_finite(v[0][k]) & trb_finite(v[1][k]) & trb_finite(v[2][k]);\n",
   "  }\n",
   "  box->first = box->count = 0;\n",
@@ -666,10 +669,12 @@ static const char *const trb_cl_text[] = {
   "\n",
   "TRB_SHARED int trb_prim_box(const trb_mesh *mesh, trbvh_u32 i, trbvh_node *box, float v[3][3], trbvh_u32 *vertex) {\n",
   "  const TRB_GLOBAL char *p;\n",
+  "  int k;\n",
   "  if (!mesh->boxes) return trb_load_triangle(mesh, i, v, vertex) ? trb_triangle_box((const float (*)[3])v, box) : -1;\n",
   "  p = (const TRB_GLOBAL char *)mesh->boxes + (size_t)i * mesh->box_stride;\n",
   "  trb_load_position(box->min, p);\n",
   "  trb_load_position(box->max, p + 12);\n",
+  "  for (k = 0; k < 3; k++) { box->min[k] += TRB_PLUS_ZERO; box->max[k] += TRB_PLUS_ZERO; }\n",
   "  box->first = box->count = 0;\n",
   "  return trb_valid_box(*box);\n",
   "}\n",
@@ -707,7 +712,7 @@ static const char *const trb_cl_text[] = {
   "    const TRB_GLOBAL char *p = (const TRB_GLOBAL char *)mesh->boxes + prim * mesh->box_stride;\n",
   "    trb_load_position(a, p);\n",
   "    trb_load_position(b, p + 12);\n",
-  "    #define TRB_AXIS(k) row->min[k][i] = a[k]; row->max[k][i] = b[k];\n",
+  "    #define TRB_AXIS(k) row->min[k][i] = a[k] + TRB_PLUS_ZERO; row->max[k][i] = b[k] + TRB_PLUS_ZERO;\n",
   "    TRB_AXIS(0) TRB_AXIS(1) TRB_AXIS(2)\n",
   "    #undef TRB_AXIS\n",
   "    row->check[i] = (a[0] + a[1] + a[2]) + (b[0] + b[1] + b[2]);\n",
@@ -721,8 +726,8 @@ static const char *const trb_cl_text[] = {
   "    trb_load_position(c, trb_position(mesh, v2));\n",
   "    #define TRB_AXIS(k) { \\\n",
   "      float low = TRB_MIN(a[k], b[k]), high = TRB_MAX(a[k], b[k]); \\\n",
-  "      row->min[k][i] = TRB_MIN(c[k], low); \\\n",
-  "      row->max[k][i] = TRB_MAX(c[k], high); }\n",
+  "      row->min[k][i] = TRB_MIN(c[k], low) + TRB_PLUS_ZERO; \\\n",
+  "      row->max[k][i] = TRB_MAX(c[k], high) + TRB_PLUS_ZERO; }\n",
   "    TRB_AXIS(0) TRB_AXIS(1) TRB_AXIS(2)\n",
   "    #undef TRB_AXIS\n",
   "    row->check[i] = (a[0] + a[1] + a[2]) + (b[0] + b[1] + b[2]) + (c[0] + c[1] + c[2]);\n",
@@ -795,7 +800,7 @@ static const char *const trb_cl_text[] = {
   "  grid.cells_per_unit = extent > 1e-30f && extent < FLT_MAX ? trb_reciprocal(grid.units_per_cell) : 0;\n",
   "  return grid;\n",
   "}\n",
-  "#line 1066 \"trbvh.h\"\n",
+  "#line 1080 \"trbvh.h\"\n",
   "#define TRB_SCALE_BITS  36\n",
   "#define TRB_SCALES      2561u\n",
   "#define TRB_SPLIT_STACK 64u\n",
@@ -852,7 +857,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "  return count;\n",
   "}\n",
-  "#line 1128 \"trbvh.h\"\n",
+  "#line 1142 \"trbvh.h\"\n",
   "#ifndef TRB_PACKED_REFS\n",
   "  #define TRB_PACKED_REFS (1u << 24)\n",
   "#endif\n",
@@ -912,7 +917,7 @@ static const char *const trb_cl_text[] = {
   "      start += n;\n",
   "    }\n",
   "}\n",
-  "#line 1195 \"trbvh.h\"\n",
+  "#line 1209 \"trbvh.h\"\n",
   "#define TRB_BLOCK    16384u\n",
   "#define TRB_TOP      1024u\n",
   "#define TRB_NEAR     98304u\n",
@@ -934,7 +939,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "TRB_CORE trbvh_node trb_curve_ref(const trb_curve *c, trb_u64 key) {\n",
   "  const trbvh_u32 ref = trb_key_ref(key, c->form);\n",
-  "#line 1226 \"trbvh.h\"\n",
+  "#line 1240 \"trbvh.h\"\n",
   "  return c->refs[ref];\n",
   "}\n",
   "\n",
@@ -942,12 +947,12 @@ static const char *const trb_cl_text[] = {
   "TRB_SHARED void trb_read_leaves(const trb_curve *c, trbvh_u32 first, trbvh_u32 count, trbvh_u32 end, trb_row *row) {\n",
   "  const trbvh_u32 next = first + count, soon = TRB_MIN(next + TRB_ROW, end);\n",
   "  trbvh_u32 i, k;\n",
-  "#line 1243 \"trbvh.h\"\n",
+  "#line 1257 \"trbvh.h\"\n",
   "  for (i = next; i < soon; i++) TRB_PREFETCH(&c->refs[trb_key_ref(c->keys[i], c->form)]);\n",
   "  for (i = 0; i < count; i++) {\n",
   "    const trbvh_node ref = c->refs[trb_key_ref(c->keys[first + i], c->form)];\n",
   "    for (k = 0; k < 3; k++) { row->min[k][i] = ref.min[k]; row->max[k][i] = ref.max[k]; }\n",
-  "    row->prim[i] = ref.first;\n",
+  "    row->prim[i] = trb_key_ref(c->keys[first + i], c->form);\n",
   "  }\n",
   "}\n",
   "\n",
@@ -961,7 +966,7 @@ static const char *const trb_cl_text[] = {
   "  code = trb_box_code(trb_curve_ref(c, a), c->grid) ^ trb_box_code(trb_curve_ref(c, b), c->grid);\n",
   "  return code ? code | (trb_u64)1 << 63 : (trbvh_u32)(a ^ b);\n",
   "}\n",
-  "#line 1265 \"trbvh.h\"\n",
+  "#line 1279 \"trbvh.h\"\n",
   "typedef struct trb_open {\n",
   "  trbvh_node node;\n",
   "  trb_u64    split;\n",
@@ -978,7 +983,7 @@ static const char *const trb_cl_text[] = {
   "  trbvh_u32  end, pairs;\n",
   "  struct { trb_u64 split; trbvh_u32 pair, prim, first_pair; } stack[TRB_OPEN_MAX];\n",
   "} trb_forest;\n",
-  "#line 1285 \"trbvh.h\"\n",
+  "#line 1299 \"trbvh.h\"\n",
   "#define TRB_TO_RESTRUCTURE 0\n",
   "#define TRB_FINAL_BLOCK    1\n",
   "#define TRB_FINAL_TOP      2\n",
@@ -1082,7 +1087,7 @@ static const char *const trb_cl_text[] = {
   "    }\n",
   "  TRBVH_ASSERT(f.height == 1);\n",
   "}\n",
-  "#line 1392 \"trbvh.h\"\n",
+  "#line 1406 \"trbvh.h\"\n",
   "#define TRB_LANE_LOAD(p)     (*(p))\n",
   "#define TRB_LANE_STORE(p, x) (*(p) = (x))\n",
   "#define TRB_LANE_OF(x)       (x)\n",
@@ -1200,7 +1205,7 @@ static const char *const trb_cl_text[] = {
   "  for (lane = 0; lane < lanes; lane++) trb_treelet_costs_1(leaves + lane, table + lane, sums + lane, costs);\n",
   "}\n",
   "#endif\n",
-  "#line 1523 \"trbvh.h\"\n",
+  "#line 1537 \"trbvh.h\"\n",
   "typedef struct trb_treelets {\n",
   "  float     leaves[TRB_TREELET * TRB_LEAF_VALUES * TRB_LANES];\n",
   "  float     table[TRB_SUBSETS * TRB_LANES + 16];\n",
@@ -1376,13 +1381,420 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "}\n",
   "#endif\n",
-  "#line 1713 \"trbvh.h\"\n",
+  "#line 1721 \"trbvh.h\"\n",
+  "typedef struct trb_move {\n",
+  "  trbvh_u32 node, target;\n",
+  "  trbvh_u32 above;\n",
+  "  float     gain;\n",
+  "} trb_move;\n",
+  "\n",
+  "typedef struct trb_mover {\n",
+  "  TRB_GLOBAL trbvh_node *nodes;\n",
+  "  TRB_GLOBAL trbvh_node *refs;\n",
+  "  TRB_GLOBAL trbvh_u32  *parents;\n",
+  "  TRB_GLOBAL trbvh_u32  *scores;\n",
+  "  TRB_GLOBAL trb_move   *moves;\n",
+  "  TRB_GLOBAL trbvh_u32  *owners;\n",
+  "  TRB_GLOBAL trbvh_u32  *list;\n",
+  "  trb_costs  costs;\n",
+  "} trb_mover;\n",
+  "#define TRB_MOVES_MAX(refs) ((refs) / 4)\n",
+  "\n",
+  "\n",
+  "TRB_CORE trb_mover trb_start_moves(TRB_GLOBAL trbvh_node *nodes, TRB_GLOBAL trbvh_node *refs, trb_words words, trb_costs costs) {\n",
+  "  trb_mover m;\n",
+  "  m.nodes = nodes;\n",
+  "  m.refs = refs;\n",
+  "  m.parents = words.plane[0];\n",
+  "  m.moves = (TRB_GLOBAL trb_move *)words.plane[1];\n",
+  "  m.owners = words.plane[2];\n",
+  "  m.scores = m.list = words.plane[3];\n",
+  "  m.costs = costs;\n",
+  "  return m;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE int trb_is_free(trbvh_node n)  { return n.count == 0; }\n",
+  "TRB_CORE int trb_is_inner(trbvh_node n) { return !trb_is_free(n) && !trb_is_single(n.count); }\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_put(const trb_mover *m, trbvh_u32 slot, trbvh_node node) {\n",
+  "  m->nodes[slot] = node;\n",
+  "  if (!trb_is_single(node.count)) m->parents[node.first / 2] = slot;\n",
+  "  else if (m->refs) m->refs[node.first].count = slot;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE trbvh_node trb_join(trbvh_node a, trbvh_node b) {\n",
+  "  a.min[0] = TRB_MIN(a.min[0], b.min[0]); a.max[0] = TRB_MAX(a.max[0], b.max[0]);\n",
+  "  a.min[1] = TRB_MIN(a.min[1], b.min[1]); a.max[1] = TRB_MAX(a.max[1], b.max[1]);\n",
+  "  a.min[2] = TRB_MIN(a.min[2], b.min[2]); a.max[2] = TRB_MAX(a.max[2], b.max[2]);\n",
+  "  return a;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_touched_pairs(const trb_mover *m, trb_move move, trbvh_u32 pairs[3]) {\n",
+  "  pairs[0] = move.node / 2;\n",
+  "  pairs[1] = m->parents[move.node / 2] / 2;\n",
+  "  pairs[2] = move.target / 2;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE int trb_owns(const trb_mover *m, trbvh_u32 i) {\n",
+  "  trbvh_u32 pairs[3];\n",
+  "  trb_touched_pairs(m, m->moves[i], pairs);\n",
+  "  return m->owners[pairs[0]] == i && m->owners[pairs[1]] == i && m->owners[pairs[2]] == i;\n",
+  "}\n",
+  "\n",
+  "TRB_CORE int trb_precedes(const trb_mover *m, trbvh_u32 i, trbvh_u32 k) {\n",
+  "  return m->moves[i].gain > m->moves[k].gain || (m->moves[i].gain == m->moves[k].gain && i < k);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "\n",
+  "#define TRB_STAYS 0x80000000u\n",
+  "\n",
+  "TRB_CORE int trb_follows(const trb_mover *m, trbvh_u32 i) {\n",
+  "  trbvh_u32 node = m->moves[i].target;\n",
+  "  for (; node != m->moves[i].above && node; node = m->parents[node / 2]) {\n",
+  "    const trbvh_u32 other = m->owners[node / 2];\n",
+  "    if (other != TRBVH_NONE && other != i && m->moves[other].gain > 0 && (m->moves[other].node & ~TRB_STAYS) == node &&\n",
+  "        trb_precedes(m, other, i)) return 1;\n",
+  "  }\n",
+  "  return 0;\n",
+  "}\n",
+  "\n",
+  "#if !defined(TRBVH_OPENCL_C) || defined(TRB_CPU)\n",
+  "TRB_CORE void trb_claim(const trb_mover *m, trbvh_u32 i) {\n",
+  "  trbvh_u32 pairs[3], k;\n",
+  "  trb_touched_pairs(m, m->moves[i], pairs);\n",
+  "  for (k = 0; k < 3; k++) {\n",
+  "    const trbvh_u32 owner = m->owners[pairs[k]];\n",
+  "    if (owner == TRBVH_NONE || trb_precedes(m, i, owner)) m->owners[pairs[k]] = i;\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_choose_moves(const trb_mover *m, trbvh_u32 count) {\n",
+  "  trbvh_u32 pairs[3], i, k;\n",
+  "  for (i = 0; i < count; i++)\n",
+  "    if (m->moves[i].gain > 0) trb_claim(m, i);\n",
+  "  for (i = 0; i < count; i++)\n",
+  "    if (m->moves[i].gain > 0 && !trb_owns(m, i)) m->moves[i].gain = -m->moves[i].gain;\n",
+  "  for (i = 0; i < count; i++)\n",
+  "    if (m->moves[i].gain > 0 && trb_follows(m, i)) m->moves[i].node |= TRB_STAYS;\n",
+  "  for (i = 0; i < count; i++) {\n",
+  "    TRB_GLOBAL trb_move *move = &m->moves[i];\n",
+  "    if (move->gain == 0) continue;\n",
+  "    if (move->node & TRB_STAYS) {\n",
+  "      move->node &= ~TRB_STAYS;\n",
+  "      move->gain = -move->gain;\n",
+  "    }\n",
+  "    trb_touched_pairs(m, *move, pairs);\n",
+  "    for (k = 0; k < 3; k++) m->owners[pairs[k]] = TRBVH_NONE;\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_list_above(const trb_mover *m, trbvh_u32 slot, trbvh_u32 count) {\n",
+  "  while (slot) {\n",
+  "    TRB_GLOBAL trbvh_u32 *listed;\n",
+  "    slot = m->parents[slot / 2];\n",
+  "    listed = &m->owners[m->nodes[slot].first / 2];\n",
+  "    if (*listed != TRBVH_NONE) break;\n",
+  "    *listed = 0;\n",
+  "    m->list[count++] = slot;\n",
+  "  }\n",
+  "  return count;\n",
+  "}\n",
+  "\n",
+  "TRB_CORE void trb_remake(const trb_mover *m, trbvh_u32 node) {\n",
+  "  const trbvh_u32 pair = m->nodes[node].first;\n",
+  "  m->nodes[node] = trb_parent(m->nodes[pair], m->nodes[pair + 1], pair, m->costs);\n",
+  "}\n",
+  "\n",
+  "TRB_CORE void trb_remake_listed(const trb_mover *m, trbvh_u32 begin, trbvh_u32 end) {\n",
+  "  for (; begin < end; begin++) {\n",
+  "    const trbvh_u32 node = m->list[begin];\n",
+  "    m->owners[m->nodes[node].first / 2] = TRBVH_NONE;\n",
+  "    trb_remake(m, node);\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED void trb_remake_moved(const trb_mover *m, trbvh_u32 count) {\n",
+  "  trbvh_u32 listed = 0, i;\n",
+  "  for (i = 0; i < count; i++) {\n",
+  "    TRB_GLOBAL trb_move *move = &m->moves[i];\n",
+  "    const trb_move moved = *move;\n",
+  "    if (!(moved.gain > 0)) continue;\n",
+  "    move->target = listed;\n",
+  "    move->above = listed = trb_list_above(m, moved.target, listed);\n",
+  "    listed = trb_list_above(m, moved.above, listed);\n",
+  "  }\n",
+  "  while (i--) {\n",
+  "    TRB_GLOBAL trb_move *move = &m->moves[i];\n",
+  "    if (!(move->gain > 0)) continue;\n",
+  "    trb_remake_listed(m, move->above, listed);\n",
+  "    trb_remake_listed(m, move->target, move->above);\n",
+  "    listed = move->target;\n",
+  "    move->gain = 0;\n",
+  "  }\n",
+  "}\n",
+  "#endif\n",
+  "#line 1889 \"trbvh.h\"\n",
+  "#define TRB_MOVE_BATCHES 4u\n",
+  "#define TRB_SCORES       2048u\n",
+  "#define TRB_SCORE_SHIFT  20\n",
+  "#define TRB_SEARCH_STEPS 64u\n",
+  "#define TRB_SEARCHES     256u\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_score(float above, float area, float both) {\n",
+  "  const float tame = TRB_MIN(both, 1 / TRB_TINY), ratio = above * trb_reciprocal(TRB_MAX(tame, TRB_TINY));\n",
+  "  const float score = (above - area) * ratio;\n",
+  "  return score > 0 ? trb_bits(TRB_MIN(score, FLT_MAX)) >> TRB_SCORE_SHIFT : 0;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_score_pair(const trb_mover *m, trbvh_u32 pair) {\n",
+  "  const trbvh_node left = m->nodes[2 * pair], right = m->nodes[2 * pair + 1];\n",
+  "  const trbvh_node parent = trb_parent(left, right, 0, m->costs);\n",
+  "  trbvh_u32 scores = 0;\n",
+  "  if (!trb_is_free(left) && !trb_is_leaf(parent.count)) {\n",
+  "    const float above = trb_area(parent), l = trb_area(left), r = trb_area(right);\n",
+  "    scores = trb_score(above, l, l + r) << 16 | trb_score(above, r, l + r);\n",
+  "  }\n",
+  "  if (trb_is_inner(left)) m->parents[left.first / 2] = 2 * pair;\n",
+  "  if (trb_is_inner(right)) m->parents[right.first / 2] = 2 * pair + 1;\n",
+  "  m->scores[pair] = scores;\n",
+  "  return scores;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_lowest_score(const TRB_GLOBAL trbvh_u32 *histogram, trbvh_u32 wanted) {\n",
+  "  trbvh_u32 lowest = TRB_SCORES, found = 0;\n",
+  "  while (lowest > 1 && found < wanted) found += histogram[--lowest];\n",
+  "  return lowest;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE float trb_least_gain(trbvh_u32 lowest) { return trb_float(lowest << TRB_SCORE_SHIFT) * 0.0625f; }\n",
+  "#line 1931 \"trbvh.h\"\n",
+  "TRB_SHARED trb_move trb_find_place(const trb_mover *m, trbvh_u32 node, float least) {\n",
+  "  const trbvh_node n = m->nodes[node];\n",
+  "  const float area = trb_area(n);\n",
+  "  const trbvh_u32 parent = m->parents[node / 2];\n",
+  "  trbvh_u32 pivot = parent, other = node ^ 1u, steps = TRB_SEARCH_STEPS, waiting, side, k;\n",
+  "  struct { float rest; trbvh_u32 pair; } stack[TRB_SEARCH_STEPS + 1];\n",
+  "  trbvh_node without = m->nodes[other];\n",
+  "  float saved = trb_area(m->nodes[parent]);\n",
+  "  int shrinks = 1;\n",
+  "  trb_move best;\n",
+  "  best.node = node;\n",
+  "  best.target = best.above = 0;\n",
+  "  best.gain = least;\n",
+  "  while (shrinks || saved - area > best.gain) {\n",
+  "    const trbvh_node there = m->nodes[other];\n",
+  "    const float joint = trb_area(trb_join(there, n)), rest = saved - joint + trb_area(there);\n",
+  "    waiting = 0;\n",
+  "    if (pivot != parent && saved - joint > best.gain) {\n",
+  "      best.gain = saved - joint;\n",
+  "      best.target = other;\n",
+  "      best.above = pivot;\n",
+  "    }\n",
+  "    if (!trb_is_leaf(there.count) && rest - area > best.gain) {\n",
+  "      stack[waiting].rest = rest;\n",
+  "      stack[waiting++].pair = there.first;\n",
+  "    }\n",
+  "    while (waiting && steps) {\n",
+  "      const float above = stack[--waiting].rest;\n",
+  "      const trbvh_u32 pair = stack[waiting].pair;\n",
+  "      float below[2];\n",
+  "      if (!(above - area > best.gain)) continue;\n",
+  "      steps--;\n",
+  "      for (side = 0; side < 2; side++) {\n",
+  "        const trbvh_node child = m->nodes[pair + side];\n",
+  "        const float both = trb_area(trb_join(child, n));\n",
+  "        below[side] = trb_is_leaf(child.count) ? 0 : above - both + trb_area(child);\n",
+  "        if (above - both > best.gain) {\n",
+  "          best.gain = above - both;\n",
+  "          best.target = pair + side;\n",
+  "          best.above = pivot;\n",
+  "        }\n",
+  "      }\n",
+  "      for (side = below[1] > below[0], k = 0; k < 2; k++) {\n",
+  "        side ^= 1u;\n",
+  "        if (below[side] - area > best.gain) {\n",
+  "          stack[waiting].rest = below[side];\n",
+  "          stack[waiting++].pair = m->nodes[pair + side].first;\n",
+  "        }\n",
+  "      }\n",
+  "    }\n",
+  "    if (pivot != parent) {\n",
+  "      const float whole = trb_area(m->nodes[pivot]);\n",
+  "      if (shrinks) {\n",
+  "        without = trb_join(without, there);\n",
+  "        saved += whole - trb_area(without);\n",
+  "        shrinks = trb_area(without) < whole;\n",
+  "      }\n",
+  "      if (pivot && saved - whole > best.gain) {\n",
+  "        best.gain = saved - whole;\n",
+  "        best.target = pivot;\n",
+  "        best.above = m->parents[pivot / 2];\n",
+  "      }\n",
+  "    }\n",
+  "    if (pivot == 0) break;\n",
+  "    other = pivot ^ 1u;\n",
+  "    pivot = m->parents[pivot / 2];\n",
+  "  }\n",
+  "  if (!best.target) best.gain = 0;\n",
+  "  return best;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_search(const trb_mover *m, trbvh_u32 i, trbvh_u32 batch, float least) {\n",
+  "  TRB_GLOBAL trb_move *move = &m->moves[i];\n",
+  "  const trbvh_u32 node = move->node;\n",
+  "  const int due = i % TRB_MOVE_BATCHES == batch || move->gain < 0;\n",
+  "  move->gain = 0;\n",
+  "  if (due && m->parents[node / 2]) *move = trb_find_place(m, node, least);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_reinsert(const trb_mover *m, TRB_GLOBAL trb_move *move) {\n",
+  "  const trbvh_u32 slot = move->target, pair = move->node & ~1u, parent = m->parents[pair / 2];\n",
+  "  const trbvh_node node = m->nodes[move->node], sibling = m->nodes[move->node ^ 1u], target = m->nodes[slot];\n",
+  "  trb_put(m, parent, sibling);\n",
+  "  trb_put(m, pair, node);\n",
+  "  trb_put(m, pair + 1, target);\n",
+  "  trb_put(m, slot, trb_parent(node, target, pair, m->costs));\n",
+  "  move->target = pair;\n",
+  "  move->above = parent;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED trbvh_u32 trb_count_candidates(const trb_mover *m, trbvh_u32 first, trbvh_u32 end, trbvh_u32 lowest) {\n",
+  "  trbvh_u32 count = 0;\n",
+  "  for (; first < end; first++) {\n",
+  "    count += m->scores[first] >> 16 >= lowest;\n",
+  "    count += (m->scores[first] & 0xFFFFu) >= lowest;\n",
+  "  }\n",
+  "  return count;\n",
+  "}\n",
+  "\n",
+  "TRB_SHARED void trb_list_candidates(const trb_mover *m, trbvh_u32 first, trbvh_u32 end, trbvh_u32 lowest, trbvh_u32 at,\n",
+  "                                    trbvh_u32 most) {\n",
+  "  trbvh_u32 side;\n",
+  "  for (; first < end; first++)\n",
+  "    for (side = 0; side < 2; side++)\n",
+  "      if ((m->scores[first] >> (side ? 0 : 16) & 0xFFFFu) >= lowest && at < most) {\n",
+  "        m->moves[at].node = 2 * first + side;\n",
+  "        m->moves[at++].gain = 0;\n",
+  "      }\n",
+  "}\n",
+  "#line 2052 \"trbvh.h\"\n",
+  "#define TRB_UNSPLIT_BIAS 2.0f\n",
+  "\n",
+  "\n",
+  "typedef struct trb_climb {\n",
+  "  trbvh_u32  slot, below;\n",
+  "  trbvh_u32  height;\n",
+  "  trbvh_node without;\n",
+  "  float      saved, grown;\n",
+  "} trb_climb;\n",
+  "\n",
+  "TRB_CORE trb_climb trb_start_climb(trbvh_u32 slot, trbvh_node leaf) {\n",
+  "  trb_climb c;\n",
+  "  c.slot = c.below = slot;\n",
+  "  c.height = 0;\n",
+  "  c.without = leaf;\n",
+  "  c.saved = c.grown = 0;\n",
+  "  return c;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_climb_on(const trb_mover *m, trb_climb *c, trbvh_node leaf) {\n",
+  "  const trbvh_node n = m->nodes[c->slot];\n",
+  "  const float area = trb_area(n), weight = c->height == 0 ? m->costs.ratio : 1;\n",
+  "  c->grown += weight * (trb_area(trb_join(n, leaf)) - area);\n",
+  "  if (c->height == 0) {\n",
+  "    c->saved = weight * area;\n",
+  "  } else if (c->height == 1) {\n",
+  "    c->saved += area;\n",
+  "    c->without = m->nodes[c->below ^ 1u];\n",
+  "  } else {\n",
+  "    c->without = trb_join(c->without, m->nodes[c->below ^ 1u]);\n",
+  "    c->saved += area - trb_area(c->without);\n",
+  "  }\n",
+  "  c->height++;\n",
+  "  c->below = c->slot;\n",
+  "  c->slot = m->parents[c->slot / 2];\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_SHARED trb_move trb_find_merge(const trb_mover *m, trbvh_u32 left, trbvh_u32 right) {\n",
+  "  const trbvh_u32 left_slot = m->refs[left].count, right_slot = m->refs[right].count;\n",
+  "  const trbvh_node left_leaf = m->nodes[left_slot], right_leaf = m->nodes[right_slot];\n",
+  "  trb_climb l = trb_start_climb(left_slot, left_leaf), r = trb_start_climb(right_slot, right_leaf);\n",
+  "  float keep_left, keep_right;\n",
+  "  trb_move merge;\n",
+  "  while (l.slot != r.slot) {\n",
+  "    if (trb_count(m->nodes[l.slot].count) <= trb_count(m->nodes[r.slot].count)) trb_climb_on(m, &l, right_leaf);\n",
+  "    else trb_climb_on(m, &r, left_leaf);\n",
+  "  }\n",
+  "  if (l.height == 1) l.saved += trb_area(m->nodes[l.slot]);\n",
+  "  if (r.height == 1) r.saved += trb_area(m->nodes[r.slot]);\n",
+  "  keep_left = TRB_UNSPLIT_BIAS * r.saved - l.grown;\n",
+  "  keep_right = TRB_UNSPLIT_BIAS * l.saved - r.grown;\n",
+  "  merge.node = keep_left >= keep_right ? right_slot : left_slot;\n",
+  "  merge.target = keep_left >= keep_right ? left_slot : right_slot;\n",
+  "  merge.above = merge.target;\n",
+  "  merge.gain = TRB_MAX(keep_left, keep_right);\n",
+  "  merge.gain = TRB_MAX(merge.gain, 0.0f);\n",
+  "  return merge;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_find_ref(const trb_mover *m, trbvh_u32 slot) {\n",
+  "  const trbvh_node n = m->nodes[slot];\n",
+  "  if (slot == 1 || trb_is_free(n)) return;\n",
+  "  if (trb_is_single(n.count)) m->refs[n.first].count = slot;\n",
+  "  else m->parents[n.first / 2] = slot;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_search_merge(const trb_mover *m, trbvh_u32 i, trbvh_u32 slots) {\n",
+  "  TRB_GLOBAL trb_move *move = &m->moves[i / TRB_MOVE_BATCHES];\n",
+  "  const trbvh_u32 prim = m->refs[i].first;\n",
+  "  trbvh_u32 next = i + 1;\n",
+  "  move->gain = 0;\n",
+  "  if (prim == TRBVH_NONE || m->refs[i].count == TRBVH_NONE) return;\n",
+  "  while (next < slots && m->refs[next].first == prim && m->refs[next].count == TRBVH_NONE) next++;\n",
+  "  if (next < slots && m->refs[next].first == prim) *move = trb_find_merge(m, i, next);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_merge(const trb_mover *m, TRB_GLOBAL trb_move *move) {\n",
+  "  const trbvh_u32 pair = move->node & ~1u, parent = m->parents[pair / 2];\n",
+  "  const trbvh_node gone = m->nodes[move->node];\n",
+  "  trbvh_node grown = trb_join(m->nodes[move->target], gone);\n",
+  "  grown = trb_reference(grown, m->costs);\n",
+  "  m->nodes[move->target] = grown;\n",
+  "  trb_put(m, parent, m->nodes[move->node ^ 1u]);\n",
+  "  m->refs[gone.first].count = TRBVH_NONE;\n",
+  "  m->nodes[pair].count = m->nodes[pair + 1].count = 0;\n",
+  "  if (move->target == (move->node ^ 1u)) move->target = parent;\n",
+  "  move->above = parent;\n",
+  "}\n",
+  "#line 2161 \"trbvh.h\"\n",
   "typedef struct trb_collapser {\n",
   "  TRB_GLOBAL trbvh_node *nodes;\n",
   "  trb_words words;\n",
   "  trb_costs costs;\n",
   "  float     cost_node, cost_prim;\n",
-  "  trbvh_u32 split;\n",
+  "  const TRB_GLOBAL trbvh_node *refs;\n",
   "  const TRB_GLOBAL trb_u64 *keys;\n",
   "  trb_key_form form;\n",
   "  trbvh_u32    ref_count;\n",
@@ -1462,8 +1874,9 @@ static const char *const trb_cl_text[] = {
   "      leaf = c->nodes[leaf.first + 1];\n",
   "      continue;\n",
   "    }\n",
-  "    for (i = 0; c->split && i < count && prims[i] != leaf.first; i++) {}\n",
-  "    if (!c->split || i == count) prims[count++] = leaf.first;\n",
+  "    if (c->refs) leaf.first = c->refs[leaf.first].first;\n",
+  "    for (i = 0; c->refs && i < count && prims[i] != leaf.first; i++) {}\n",
+  "    if (!c->refs || i == count) prims[count++] = leaf.first;\n",
   "    if (waiting == 0) return count;\n",
   "    leaf = c->nodes[stack[--waiting]];\n",
   "  }\n",
@@ -1553,9 +1966,9 @@ static const char *const trb_cl_text[] = {
   "#if !defined(TRBVH_OPENCL_C) || defined(TRB_CPU)\n",
   "\n",
   "TRB_SHARED void trb_restructure_group(const trb_collapser *c, const TRB_GLOBAL trb_task *tasks, trb_group group,\n",
-  "                                      trbvh_u32 rounds) {\n",
+  "                                      trbvh_u32 gamma, trbvh_u32 rounds) {\n",
   "  const trbvh_u32 first_ref = tasks[group.first_task].first_ref;\n",
-  "  trbvh_u32 gamma = TRB_TREELET, i, seeds;\n",
+  "  trbvh_u32 i, seeds;\n",
   "  for (; rounds && gamma <= TRB_BLOCK; rounds--, gamma *= 2) {\n",
   "    for (i = 0, seeds = 0; i < group.tasks; i++) {\n",
   "      trbvh_u32 node = tasks[group.first_task + i].node;\n",
@@ -1573,7 +1986,7 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE void trb_prefetch_pairs(const trb_collapser *c, trbvh_u32 ref, trbvh_u32 count) {\n",
   "  for (; count-- && ref > 2 * TRB_AHEAD; ref--) TRB_PREFETCH(&c->nodes[2 * (ref - 2 * TRB_AHEAD)]);\n",
   "}\n",
-  "#line 1913 \"trbvh.h\"\n",
+  "#line 2362 \"trbvh.h\"\n",
   "TRB_SHARED void trb_settle_task(const trb_collapser *c, TRB_GLOBAL trb_task *task) {\n",
   "  TRB_GLOBAL trbvh_u32 *order = c->words.plane[0] + task->first_ref, *prims = c->words.plane[1] + task->first_ref;\n",
   "  trbvh_u32 waiting = 0, pairs = 0, refs = task->first_ref, prim = 0, max_depth = 0, i;\n",
@@ -1741,7 +2154,7 @@ static const char *const trb_cl_text[] = {
   "    default: trb_make_form(mesh, 4, prims, first, end, out); break;\n",
   "  }\n",
   "}\n",
-  "#line 2091 \"trbvh.h\"\n",
+  "#line 2540 \"trbvh.h\"\n",
   "#define TRB_UNIT 5.9604645e-8f\n",
   "#define TRB_ABS(x) ((x) < 0 ? -(x) : (x))\n",
   "typedef struct trb_ray {\n",
@@ -1819,7 +2232,7 @@ static const char *const trb_cl_text[] = {
   "  along = TRB_MIN(along, 1);\n",
   "  return TRB_MAX(along, 0);\n",
   "}\n",
-  "#line 2175 \"trbvh.h\"\n",
+  "#line 2624 \"trbvh.h\"\n",
   "TRB_CORE int trb_hit_triangle(const TRB_GLOBAL trbvh_triangle *t, const trb_ray *r, float tmax, trbvh_hit *hit) {\n",
   "  const int x = r->axis[0], y = r->axis[1], z = r->axis[2];\n",
   "  const trb_corner a = trb_see(t->v0[x], t->v0[y], t->v0[z], r);\n",
@@ -1860,7 +2273,7 @@ static const char *const trb_cl_text[] = {
   "  hit->u = hit->v = 0;\n",
   "  hit->prim = hit->instance = TRBVH_NONE;\n",
   "}\n",
-  "#line 2219 \"trbvh.h\"\n",
+  "#line 2668 \"trbvh.h\"\n",
   "TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbvh_triangle *triangles,\n",
   "                       const trb_ray *r, int any, trbvh_hit *hit) {\n",
   "  trbvh_u32 stack_node[TRBVH_MAX_DEPTH], height = 0, node = 0, i;\n",
@@ -1911,7 +2324,7 @@ static const char *const trb_cl_text[] = {
   "#define TRB_GPU_TILE    2048u\n",
   "#define TRB_GPU_CHUNK   1024u\n",
   "#define TRB_GPU_CHUNKS  16u\n",
-  "#define TRB_GPU_LEVELS  128u\n",
+  "#define TRB_GPU_LEVELS  1024u\n",
   "#define TRB_ROOTS_MAX   (1u << 20)\n",
   "#define TRB_CPU_RAYS    64u\n",
   "#define TRB_JOB_STEP    64u\n",
@@ -1924,13 +2337,16 @@ static const char *const trb_cl_text[] = {
   "  trb_costs    costs;\n",
   "  trb_key_form form;\n",
   "  float        cost_node, cost_prim;\n",
-  "  trbvh_u32    prim_count, position_count, index_size, boxes, split_max;\n",
+  "  trbvh_u32    prim_count, position_count, index_size, boxes, split_max, ref_max;\n",
+  "  float        reinsert_share;\n",
   "\n",
   "  trb_grid     grid;\n",
   "  float        priority_unit;\n",
   "  float        sah, root_area;\n",
   "  trbvh_u32    scale_low, slots, ref_count;\n",
   "  trbvh_u32    skipped, bad, bad_vertex;\n",
+  "  trbvh_u32    lowest_score, moves;\n",
+  "  trbvh_u32    too_deep;\n",
   "  trbvh_u32    groups, tasks, leaves, prims, max_depth;\n",
   "} trb_plan;\n",
   "\n",
@@ -2042,29 +2458,31 @@ static const char *const trb_cl_text[] = {
   "static bool trb_has_gaps(const __global trb_plan *plan) { return plan->ref_count != plan->slots; }\n",
   "\n",
   "\n",
-  "static trb_collapser trb_plan_collapser(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
-  "                                        __global ulong *sorted) {\n",
+  "\n",
+  "static trb_collapser trb_plan_collapser(const __global trb_plan *plan, __global trbvh_node *nodes,\n",
+  "                                        const __global trbvh_node *refs, __global ulong *keys, __global ulong *sorted) {\n",
   "  trb_collapser c;\n",
   "  c.nodes = nodes;\n",
-  "  c.words = trb_split_words(keys, sorted, plan->ref_count);\n",
+  "  c.words = trb_split_words(keys, sorted, plan->ref_max);\n",
   "  c.costs = plan->costs;\n",
   "  c.cost_node = plan->cost_node;\n",
   "  c.cost_prim = plan->cost_prim;\n",
-  "  c.split = plan->split_max != 0;\n",
+  "  c.refs = plan->split_max ? refs : 0;\n",
   "  c.out = 0;\n",
   "  c.prims = 0;\n",
   "  return c;\n",
   "}\n",
   "\n",
   "\n",
-  "static trb_collapser trb_plan_emitter(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
-  "                                      __global ulong *sorted, __global trbvh_node *out, __global uint *prims) {\n",
-  "  trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);\n",
+  "static trb_collapser trb_plan_emitter(const __global trb_plan *plan, __global trbvh_node *nodes,\n",
+  "                                      const __global trbvh_node *refs, __global ulong *keys, __global ulong *sorted,\n",
+  "                                      __global trbvh_node *out, __global uint *prims) {\n",
+  "  trb_collapser c = trb_plan_collapser(plan, nodes, refs, keys, sorted);\n",
   "  c.out = out;\n",
   "  c.prims = prims;\n",
   "  return c;\n",
   "}\n",
-  "#line 105 \"kernels/shape.cl\"\n",
+  "#line 107 \"kernels/shape.cl\"\n",
   "static uint trb_reserve(volatile __global uint *end, uint count, __local uint *space) {\n",
   "#ifdef TRB_CPU\n",
   "  return count ? atomic_add(end, count) : 0;\n",
@@ -2517,7 +2935,9 @@ static const char *const trb_cl_text[] = {
   "  const uint id = TRB_LOCAL_ID, first = TRB_GROUP_ID * TRB_GPU_CHUNK, end = min(curve.count, first + TRB_GPU_CHUNK);\n",
   "  uint i, k, done = 0, kept = 0, total;\n",
   "  for (i = first + id; i < end; i += TRB_GROUP) {\n",
-  "    const trbvh_node ref = refs[trb_key_ref(keys[i], curve.form)];\n",
+  "    const uint number = trb_key_ref(keys[i], curve.form);\n",
+  "    trbvh_node ref = refs[number];\n",
+  "    ref.first = number;\n",
   "    trb_hang(&curve, nodes, waits, trb_reference(ref, costs), i, i);\n",
   "  }\n",
   "  for (;;) {\n",
@@ -2594,18 +3014,19 @@ static const char *const trb_cl_text[] = {
   "#ifdef TRB_CPU\n",
   "TRB_KERNEL trb_k_restructure_top(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
   "                                 __global ulong *sorted, uint rounds) {\n",
-  "  if (plan->ref_count) trb_restructure_top(nodes, trb_split_words(keys, sorted, plan->ref_count), rounds, plan->costs);\n",
+  "  if (plan->ref_count) trb_restructure_top(nodes, trb_split_words(keys, sorted, plan->ref_max), rounds, plan->costs);\n",
   "}\n",
   "\n",
   "\n",
-  "TRB_KERNEL trb_k_restructure_groups(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
-  "                                    __global ulong *sorted, __global trb_task *tasks, const __global trb_group *groups,\n",
-  "                                    uint rounds) {\n",
-  "  const trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);\n",
+  "TRB_KERNEL trb_k_restructure_groups(const __global trb_plan *plan, __global trbvh_node *nodes,\n",
+  "                                    const __global trbvh_node *refs, __global ulong *keys, __global ulong *sorted,\n",
+  "                                    __global trb_task *tasks, const __global trb_group *groups, uint gamma, uint rounds,\n",
+  "                                    uint last) {\n",
+  "  const trb_collapser c = trb_plan_collapser(plan, nodes, refs, keys, sorted);\n",
   "  uint i;\n",
   "  TRB_FOR_JOBS(i, plan->groups) {\n",
-  "    trb_restructure_group(&c, tasks, groups[i], rounds);\n",
-  "    trb_settle_group(&c, tasks, groups[i]);\n",
+  "    trb_restructure_group(&c, tasks, groups[i], gamma, rounds);\n",
+  "    if (last) trb_settle_group(&c, tasks, groups[i]);\n",
   "  }\n",
   "}\n",
   "#else\n",
@@ -2616,7 +3037,7 @@ static const char *const trb_cl_text[] = {
   "  uint i;\n",
   "  for (i = TRB_LOCAL_ID; i < TRB_GPU_LEVELS; i += TRB_GROUP) levels[i].first = levels[i].count = 0;\n",
   "  TRB_SYNC();\n",
-  "  if (TRB_LOCAL_ID != 0 || plan->ref_count == 0) return;\n",
+  "  if (TRB_LOCAL_ID != 0 || plan->ref_count == 0 || plan->too_deep) return;\n",
   "  list[0] = 0;\n",
   "  levels[0].count = trb_count(nodes[0].count) >= gamma;\n",
   "}\n",
@@ -2645,13 +3066,14 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "\n",
   "\n",
-  "TRB_KERNEL trb_k_list_levels(const __global trbvh_node *nodes, __global trb_level *levels, __global uint *list, uint gamma,\n",
-  "                             uint level) {\n",
+  "TRB_KERNEL trb_k_list_levels(__global trb_plan *plan, const __global trbvh_node *nodes, __global trb_level *levels,\n",
+  "                             __global uint *list, uint gamma, uint level) {\n",
   "  __local uint space[2];\n",
   "  for (; level + 1 < TRB_GPU_LEVELS && levels[level].count; level++) {\n",
   "    trb_list_level(nodes, levels, list, level, gamma, TRB_LOCAL_ID, TRB_GROUP, space);\n",
   "    TRB_SYNC();\n",
   "  }\n",
+  "  if (TRB_LOCAL_ID == 0 && levels[TRB_GPU_LEVELS - 1].count) plan->too_deep = 1;\n",
   "}\n",
   "\n",
   "\n",
@@ -2691,6 +3113,274 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "#endif\n",
   "#endif\n",
+  "#ifdef TRB_WITH_MOVES\n",
+  "#line 6 \"kernels/moves.cl\"\n",
+  "static trb_mover trb_plan_mover(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *refs,\n",
+  "                                __global ulong *keys, __global ulong *sorted) {\n",
+  "  return trb_start_moves(nodes, plan->split_max ? refs : 0, trb_split_words(keys, sorted, plan->ref_max), plan->costs);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "static uint trb_move_count(const __global trb_plan *plan) { return plan->too_deep ? 0 : plan->moves; }\n",
+  "\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_score(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
+  "                       __global ulong *sorted, __global uint *histograms) {\n",
+  "  const trb_mover m = trb_plan_mover(plan, nodes, 0, keys, sorted);\n",
+  "  const uint count = plan->ref_count;\n",
+  "  uint i;\n",
+  "#ifdef TRB_CPU\n",
+  "  __global uint *histogram = histograms + (size_t)TRB_GROUP_ID * TRB_SCORES;\n",
+  "  for (i = 0; i < TRB_SCORES; i++) histogram[i] = 0;\n",
+  "  TRB_FOR(i, count) {\n",
+  "    uint scores;\n",
+  "    if (i == 0) continue;\n",
+  "    scores = trb_score_pair(&m, i);\n",
+  "    histogram[scores >> 16]++;\n",
+  "    histogram[scores & 0xFFFFu]++;\n",
+  "  }\n",
+  "#else\n",
+  "  __local uint histogram[TRB_SCORES];\n",
+  "  for (i = TRB_LOCAL_ID; i < TRB_SCORES; i += TRB_GROUP) histogram[i] = 0;\n",
+  "  TRB_SYNC();\n",
+  "  TRB_FOR(i, count) {\n",
+  "    uint scores;\n",
+  "    if (i == 0) continue;\n",
+  "    scores = trb_score_pair(&m, i);\n",
+  "    if (scores >> 16) atomic_inc((volatile __local uint *)&histogram[scores >> 16]);\n",
+  "    if (scores & 0xFFFFu) atomic_inc((volatile __local uint *)&histogram[scores & 0xFFFFu]);\n",
+  "  }\n",
+  "  TRB_SYNC();\n",
+  "  for (i = TRB_LOCAL_ID; i < TRB_SCORES; i += TRB_GROUP)\n",
+  "    if (histogram[i]) atomic_add((volatile __global uint *)&histograms[i], histogram[i]);\n",
+  "#endif\n",
+  "  if (get_global_id(0) == 0 && count) m.parents[0] = m.parents[nodes[0].first / 2] = 0;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_choose_score(__global trb_plan *plan, __global uint *histograms) {\n",
+  "  const uint wanted = (uint)(plan->reinsert_share * (float)plan->ref_count);\n",
+  "#ifdef TRB_CPU\n",
+  "  const uint blocks = plan->ref_count ? (plan->ref_count - 1) / TRB_BLOCK + 1 : 0;\n",
+  "  uint block, i;\n",
+  "  for (block = 1; block < blocks; block++)\n",
+  "    for (i = 0; i < TRB_SCORES; i++) histograms[i] += histograms[(size_t)block * TRB_SCORES + i];\n",
+  "#endif\n",
+  "  if (TRB_LOCAL_ID == 0) plan->lowest_score = trb_lowest_score(histograms, wanted);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_count_candidates(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
+  "                                  __global ulong *sorted, __global uint *counts) {\n",
+  "  __local uint space[TRB_GROUP];\n",
+  "  const trb_mover m = trb_plan_mover(plan, nodes, 0, keys, sorted);\n",
+  "  const uint first = TRB_GROUP_ID * TRB_TILE, end = min(plan->ref_count, first + TRB_TILE), lowest = plan->lowest_score;\n",
+  "  uint i, count = 0, total;\n",
+  "  for (i = first + TRB_LOCAL_ID; i < end; i += TRB_GROUP)\n",
+  "    if (i) count += trb_count_candidates(&m, i, i + 1, lowest);\n",
+  "  trb_scan(count, space, &total);\n",
+  "  if (TRB_LOCAL_ID == 0) counts[TRB_GROUP_ID] = total;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_list_candidates(__global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
+  "                                 __global ulong *sorted, const __global uint *starts) {\n",
+  "  __local uint space[TRB_GROUP];\n",
+  "  const trb_mover m = trb_plan_mover(plan, nodes, 0, keys, sorted);\n",
+  "  const uint first = TRB_GROUP_ID * TRB_TILE, end = min(plan->ref_count, first + TRB_TILE), lowest = plan->lowest_score;\n",
+  "  const uint most = TRB_MOVES_MAX(plan->ref_count);\n",
+  "  uint i, start = starts[TRB_GROUP_ID], total;\n",
+  "  for (i = first; i < end; i += TRB_GROUP) {\n",
+  "    const uint pair = i + TRB_LOCAL_ID;\n",
+  "    const uint count = pair && pair < end ? trb_count_candidates(&m, pair, pair + 1, lowest) : 0;\n",
+  "    const uint at = start + trb_scan(count, space, &total);\n",
+  "    if (count) trb_list_candidates(&m, pair, pair + 1, lowest, at, most);\n",
+  "    start += total;\n",
+  "  }\n",
+  "  if (TRB_LOCAL_ID == 0 && TRB_GROUP_ID == (uint)get_num_groups(0) - 1) plan->moves = min(start, most);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_search(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
+  "                        __global ulong *sorted, uint batch) {\n",
+  "  const trb_mover m = trb_plan_mover(plan, nodes, 0, keys, sorted);\n",
+  "  const uint count = trb_move_count(plan);\n",
+  "  const float least = trb_least_gain(plan->lowest_score);\n",
+  "#ifdef TRB_CPU\n",
+  "  uint job, i;\n",
+  "  TRB_FOR_JOBS(job, (count + TRB_SEARCHES - 1) / TRB_SEARCHES) {\n",
+  "    const uint end = min(count, (job + 1) * TRB_SEARCHES);\n",
+  "    for (i = job * TRB_SEARCHES; i < end; i++) {\n",
+  "      trb_search(&m, i, batch, least);\n",
+  "    }\n",
+  "  }\n",
+  "#else\n",
+  "  uint four, i;\n",
+  "  TRB_FOR(four, (count + TRB_MOVE_BATCHES - 1) / TRB_MOVE_BATCHES)\n",
+  "    for (i = four * TRB_MOVE_BATCHES; i < count && i < (four + 1) * TRB_MOVE_BATCHES; i++) trb_search(&m, i, batch, least);\n",
+  "#endif\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_forget_refs(__global trb_plan *plan, __global trbvh_node *refs) {\n",
+  "  const uint slots = plan->slots;\n",
+  "  uint i;\n",
+  "  TRB_FOR(i, slots) refs[i].count = TRBVH_NONE;\n",
+  "  if (get_global_id(0) == 0) plan->moves = TRB_MOVES_MAX(slots);\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_find_refs(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *refs,\n",
+  "                           __global ulong *keys, __global ulong *sorted) {\n",
+  "  const trb_mover m = trb_plan_mover(plan, nodes, refs, keys, sorted);\n",
+  "  const uint count = plan->too_deep ? 0 : plan->ref_count;\n",
+  "  uint i;\n",
+  "  TRB_FOR(i, count) {\n",
+  "    trb_find_ref(&m, 2 * i);\n",
+  "    trb_find_ref(&m, 2 * i + 1);\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_search_merges(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *refs,\n",
+  "                               __global ulong *keys, __global ulong *sorted, uint batch) {\n",
+  "  const trb_mover m = trb_plan_mover(plan, nodes, refs, keys, sorted);\n",
+  "  const uint count = trb_move_count(plan), slots = plan->slots;\n",
+  "  uint i;\n",
+  "#ifdef TRB_CPU\n",
+  "  uint job;\n",
+  "  TRB_FOR_JOBS(job, (count + TRB_SEARCHES - 1) / TRB_SEARCHES)\n",
+  "    for (i = job * TRB_SEARCHES; i < count && i < (job + 1) * TRB_SEARCHES; i++)\n",
+  "      trb_search_merge(&m, i * TRB_MOVE_BATCHES + batch, slots);\n",
+  "#else\n",
+  "  TRB_FOR(i, count) trb_search_merge(&m, i * TRB_MOVE_BATCHES + batch, slots);\n",
+  "#endif\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_make_move(const trb_mover *m, uint i, uint merges) {\n",
+  "  if (!(m->moves[i].gain > 0)) return;\n",
+  "  if (merges) trb_merge(m, &m->moves[i]);\n",
+  "  else trb_reinsert(m, &m->moves[i]);\n",
+  "}\n",
+  "\n",
+  "#ifdef TRB_CPU\n",
+  "\n",
+  "TRB_KERNEL trb_k_move(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *refs,\n",
+  "                      __global ulong *keys, __global ulong *sorted, uint merges) {\n",
+  "  const trb_mover m = trb_plan_mover(plan, nodes, refs, keys, sorted);\n",
+  "  const uint count = trb_move_count(plan);\n",
+  "  uint i;\n",
+  "  trb_choose_moves(&m, count);\n",
+  "  for (i = 0; i < count; i++) trb_make_move(&m, i, merges);\n",
+  "  trb_remake_moved(&m, count);\n",
+  "}\n",
+  "#else\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_claim_gains(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
+  "                             __global ulong *sorted, __global uint *gains) {\n",
+  "  const trb_mover m = trb_plan_mover(plan, nodes, 0, keys, sorted);\n",
+  "  const uint count = trb_move_count(plan);\n",
+  "  uint i, k, pairs[3];\n",
+  "  TRB_FOR(i, count) {\n",
+  "    const trb_move move = m.moves[i];\n",
+  "    if (!(move.gain > 0)) continue;\n",
+  "    trb_touched_pairs(&m, move, pairs);\n",
+  "    for (k = 0; k < 3; k++) atomic_max((volatile __global uint *)&gains[pairs[k]], as_uint(move.gain));\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_claim_pairs(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
+  "                             __global ulong *sorted, const __global uint *gains) {\n",
+  "  const trb_mover m = trb_plan_mover(plan, nodes, 0, keys, sorted);\n",
+  "  const uint count = trb_move_count(plan);\n",
+  "  uint i, k, pairs[3];\n",
+  "  TRB_FOR(i, count) {\n",
+  "    const trb_move move = m.moves[i];\n",
+  "    if (!(move.gain > 0)) continue;\n",
+  "    trb_touched_pairs(&m, move, pairs);\n",
+  "    for (k = 0; k < 3; k++)\n",
+  "      if (gains[pairs[k]] == as_uint(move.gain)) atomic_min((volatile __global uint *)&m.owners[pairs[k]], i);\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_stand_back(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
+  "                            __global ulong *sorted) {\n",
+  "  const trb_mover m = trb_plan_mover(plan, nodes, 0, keys, sorted);\n",
+  "  const uint count = trb_move_count(plan);\n",
+  "  uint i;\n",
+  "  TRB_FOR(i, count)\n",
+  "    if (m.moves[i].gain > 0 && !trb_owns(&m, i)) m.moves[i].gain = -m.moves[i].gain;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_follow(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
+  "                        __global ulong *sorted) {\n",
+  "  const trb_mover m = trb_plan_mover(plan, nodes, 0, keys, sorted);\n",
+  "  const uint count = trb_move_count(plan);\n",
+  "  uint i;\n",
+  "  TRB_FOR(i, count)\n",
+  "    if (m.moves[i].gain > 0 && trb_follows(&m, i)) m.moves[i].node |= TRB_STAYS;\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_release(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
+  "                         __global ulong *sorted, __global uint *gains) {\n",
+  "  const trb_mover m = trb_plan_mover(plan, nodes, 0, keys, sorted);\n",
+  "  const uint count = trb_move_count(plan);\n",
+  "  uint i, k, pairs[3];\n",
+  "  TRB_FOR(i, count) {\n",
+  "    trb_move move = m.moves[i];\n",
+  "    if (move.gain == 0) continue;\n",
+  "    if (move.node & TRB_STAYS) {\n",
+  "      move.node &= ~TRB_STAYS;\n",
+  "      move.gain = -move.gain;\n",
+  "      m.moves[i] = move;\n",
+  "    }\n",
+  "    trb_touched_pairs(&m, move, pairs);\n",
+  "    for (k = 0; k < 3; k++) {\n",
+  "      m.owners[pairs[k]] = TRBVH_NONE;\n",
+  "      gains[pairs[k]] = 0;\n",
+  "    }\n",
+  "  }\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_move(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *refs,\n",
+  "                      __global ulong *keys, __global ulong *sorted, uint merges) {\n",
+  "  const trb_mover m = trb_plan_mover(plan, nodes, refs, keys, sorted);\n",
+  "  const uint count = trb_move_count(plan);\n",
+  "  uint i;\n",
+  "  TRB_FOR(i, count) trb_make_move(&m, i, merges);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "static void trb_remake_node(__global trbvh_node *nodes, uint node, trb_costs costs) {\n",
+  "  const uint pair = nodes[node].first;\n",
+  "  nodes[node] = trb_parent(nodes[pair], nodes[pair + 1], pair, costs);\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_remake_level(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,\n",
+  "                              const __global uint *list, uint level) {\n",
+  "  const trb_costs costs = plan->costs;\n",
+  "  const uint first = levels[level].first, count = levels[level].count;\n",
+  "  uint i;\n",
+  "  TRB_FOR(i, count) trb_remake_node(nodes, list[first + i], costs);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_remake_levels(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,\n",
+  "                               const __global uint *list, uint level) {\n",
+  "  const trb_costs costs = plan->costs;\n",
+  "  uint lowest = level, i;\n",
+  "  while (lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;\n",
+  "  for (lowest++; lowest-- > level;) {\n",
+  "    for (i = TRB_LOCAL_ID; i < levels[lowest].count; i += TRB_GROUP)\n",
+  "      trb_remake_node(nodes, list[levels[lowest].first + i], costs);\n",
+  "    TRB_SYNC();\n",
+  "  }\n",
+  "}\n",
+  "#endif\n",
+  "#endif\n",
   "#ifdef TRB_WITH_COLLAPSE\n",
   "#line 5 \"kernels/collapse.cl\"\n",
   "static void trb_emit_padding(__global trbvh_node *out) {\n",
@@ -2702,19 +3392,20 @@ static const char *const trb_cl_text[] = {
   "\n",
   "TRB_KERNEL trb_k_find_tasks(__global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys, __global ulong *sorted,\n",
   "                            __global trb_task *tasks, __global trb_group *groups) {\n",
-  "  const trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);\n",
+  "  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, keys, sorted);\n",
   "  float sah = 0;\n",
   "  if (TRB_LOCAL_ID != 0) return;\n",
-  "  plan->tasks = plan->ref_count ? trb_find_tasks(&c, 0, tasks, &sah) : 0;\n",
+  "  plan->tasks = plan->ref_count && !plan->too_deep ? trb_find_tasks(&c, 0, tasks, &sah) : 0;\n",
   "  plan->groups = trb_find_groups(tasks, plan->tasks, groups);\n",
   "  plan->sah = sah;\n",
   "  plan->root_area = trb_sah_term(nodes[0], 1);\n",
   "}\n",
   "\n",
   "#ifdef TRB_CPU\n",
-  "TRB_KERNEL trb_k_settle_groups(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
-  "                               __global ulong *sorted, __global trb_task *tasks, const __global trb_group *groups) {\n",
-  "  const trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);\n",
+  "TRB_KERNEL trb_k_settle_groups(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trbvh_node *refs,\n",
+  "                               __global ulong *keys, __global ulong *sorted, __global trb_task *tasks,\n",
+  "                               const __global trb_group *groups) {\n",
+  "  const trb_collapser c = trb_plan_collapser(plan, nodes, refs, keys, sorted);\n",
   "  uint i;\n",
   "  TRB_FOR_JOBS(i, plan->groups) trb_settle_group(&c, tasks, groups[i]);\n",
   "}\n",
@@ -2736,7 +3427,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "TRB_KERNEL trb_k_emit_top(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
   "                          __global ulong *sorted, __global trb_task *tasks, __global trbvh_node *out, __global uint *prims) {\n",
-  "  const trb_collapser c = trb_plan_emitter(plan, nodes, keys, sorted, out, prims);\n",
+  "  const trb_collapser c = trb_plan_emitter(plan, nodes, 0, keys, sorted, out, prims);\n",
   "  trb_emit_padding(out);\n",
   "  trb_emit_top(&c, tasks, plan->tasks);\n",
   "}\n",
@@ -2744,7 +3435,7 @@ static const char *const trb_cl_text[] = {
   "TRB_KERNEL trb_k_emit_tasks(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
   "                            __global ulong *sorted, const __global trb_task *tasks, __global trbvh_node *out,\n",
   "                            __global uint *prims) {\n",
-  "  const trb_collapser c = trb_plan_emitter(plan, nodes, keys, sorted, out, prims);\n",
+  "  const trb_collapser c = trb_plan_emitter(plan, nodes, 0, keys, sorted, out, prims);\n",
   "  uint i;\n",
   "  TRB_FOR_JOBS(i, plan->tasks) trb_emit_task(&c, tasks[i]);\n",
   "}\n",
@@ -2752,7 +3443,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "TRB_CORE uint trb_count_prims(const trb_collapser *c, trbvh_node leaf) {\n",
   "  uint prims[TRB_MAX_LEAF];\n",
-  "  return c->split ? trb_leaf_prims(c, leaf, prims) : trb_count(leaf.count);\n",
+  "  return c->refs ? trb_leaf_prims(c, leaf, prims) : trb_count(leaf.count);\n",
   "}\n",
   "\n",
   "\n",
@@ -2771,7 +3462,7 @@ static const char *const trb_cl_text[] = {
   "  uint i;\n",
   "  for (i = TRB_LOCAL_ID; i < TRB_GPU_LEVELS; i += TRB_GROUP) levels[i].first = levels[i].count = 0;\n",
   "  TRB_SYNC();\n",
-  "  if (TRB_LOCAL_ID != 0 || plan->ref_count == 0) return;\n",
+  "  if (TRB_LOCAL_ID != 0 || plan->ref_count == 0 || plan->too_deep) return;\n",
   "  list[0] = first_refs[0] = 0;\n",
   "  levels[0].count = !trb_is_leaf(nodes[0].count);\n",
   "}\n",
@@ -2804,7 +3495,7 @@ static const char *const trb_cl_text[] = {
   "                            __global ulong *sorted, __global trb_level *levels, __global uint *list,\n",
   "                            __global uint *first_refs, uint level) {\n",
   "  __local uint space[2];\n",
-  "  const trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);\n",
+  "  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, keys, sorted);\n",
   "  trb_list_inner(&c, levels, list, first_refs, level, (uint)get_global_id(0), (uint)get_global_size(0), space);\n",
   "}\n",
   "\n",
@@ -2813,7 +3504,7 @@ static const char *const trb_cl_text[] = {
   "                           __global ulong *sorted, __global trb_level *levels, __global uint *list,\n",
   "                           __global uint *first_refs, uint level) {\n",
   "  __local uint space[2];\n",
-  "  const trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);\n",
+  "  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, keys, sorted);\n",
   "  for (; level + 1 < TRB_GPU_LEVELS && levels[level].count; level++) {\n",
   "    trb_list_inner(&c, levels, list, first_refs, level, TRB_LOCAL_ID, TRB_GROUP, space);\n",
   "    TRB_SYNC();\n",
@@ -2843,18 +3534,20 @@ static const char *const trb_cl_text[] = {
   "  places[node.first / 2] = sum;\n",
   "}\n",
   "\n",
-  "TRB_KERNEL trb_k_count_inner(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,\n",
-  "                             const __global uint *list, __global trb_place *places, uint level) {\n",
-  "  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0);\n",
+  "TRB_KERNEL trb_k_count_inner(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trbvh_node *refs,\n",
+  "                             const __global trb_level *levels, const __global uint *list, __global trb_place *places,\n",
+  "                             uint level) {\n",
+  "  const trb_collapser c = trb_plan_collapser(plan, nodes, refs, 0, 0);\n",
   "  const uint first = levels[level].first, count = levels[level].count;\n",
   "  uint i;\n",
   "  TRB_FOR(i, count) trb_count_inner(&c, places, list[first + i]);\n",
   "}\n",
   "\n",
   "\n",
-  "TRB_KERNEL trb_k_count_rest(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,\n",
-  "                            const __global uint *list, __global trb_place *places, uint level) {\n",
-  "  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0);\n",
+  "TRB_KERNEL trb_k_count_rest(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trbvh_node *refs,\n",
+  "                            const __global trb_level *levels, const __global uint *list, __global trb_place *places,\n",
+  "                            uint level) {\n",
+  "  const trb_collapser c = trb_plan_collapser(plan, nodes, refs, 0, 0);\n",
   "  uint lowest = level, i;\n",
   "  while (lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;\n",
   "  for (lowest++; lowest-- > level;) {\n",
@@ -2865,13 +3558,13 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "\n",
   "\n",
-  "TRB_KERNEL trb_k_sum_inner(__global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,\n",
-  "                           __global trb_place *places) {\n",
-  "  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0);\n",
+  "TRB_KERNEL trb_k_sum_inner(__global trb_plan *plan, __global trbvh_node *nodes, const __global trbvh_node *refs,\n",
+  "                           const __global trb_level *levels, __global trb_place *places) {\n",
+  "  const trb_collapser c = trb_plan_collapser(plan, nodes, refs, 0, 0);\n",
   "  uint depth = 0;\n",
   "  if (TRB_LOCAL_ID != 0) return;\n",
   "  plan->leaves = plan->prims = plan->max_depth = 0;\n",
-  "  if (plan->ref_count == 0) return;\n",
+  "  if (plan->ref_count == 0 || plan->too_deep) return;\n",
   "  plan->root_area = trb_sah_term(nodes[0], 1);\n",
   "  if (trb_is_leaf(nodes[0].count)) {\n",
   "    plan->leaves = 1;\n",
@@ -2910,19 +3603,19 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "}\n",
   "\n",
-  "TRB_KERNEL trb_k_emit_root(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *out,\n",
-  "                           __global uint *prims) {\n",
-  "  const trb_collapser c = trb_plan_emitter(plan, nodes, 0, 0, out, prims);\n",
+  "TRB_KERNEL trb_k_emit_root(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trbvh_node *refs,\n",
+  "                           __global trbvh_node *out, __global uint *prims) {\n",
+  "  const trb_collapser c = trb_plan_emitter(plan, nodes, refs, 0, 0, out, prims);\n",
   "  if (TRB_LOCAL_ID != 0) return;\n",
   "  trb_emit_padding(out);\n",
   "  if (trb_is_leaf(nodes[0].count)) trb_emit_leaf(&c, nodes[0], 0, 0);\n",
   "  else trb_emit_inner(&c, nodes[0], 0, 1);\n",
   "}\n",
   "\n",
-  "TRB_KERNEL trb_k_emit_level(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,\n",
-  "                            const __global uint *list, __global trb_place *places, __global trbvh_node *out,\n",
-  "                            __global uint *prims, uint level) {\n",
-  "  const trb_collapser c = trb_plan_emitter(plan, nodes, 0, 0, out, prims);\n",
+  "TRB_KERNEL trb_k_emit_level(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trbvh_node *refs,\n",
+  "                            const __global trb_level *levels, const __global uint *list, __global trb_place *places,\n",
+  "                            __global trbvh_node *out, __global uint *prims, uint level) {\n",
+  "  const trb_collapser c = trb_plan_emitter(plan, nodes, refs, 0, 0, out, prims);\n",
   "  const uint first = levels[level].first, count = levels[level].count;\n",
   "  uint i;\n",
   "  TRB_FOR(i, count) trb_place_children(&c, places, list[first + i]);\n",
@@ -3043,9 +3736,9 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "#endif\n",
 };
-#define TRB_CL_CORE_LINES 1855u   /* entries of trb_cl_text for user kernels: types, core, traversal */
-#define TRB_CL_LINES      2925u   /* all entries */
-#define TRB_CL_HASH       "f5f2e88ff8a7aeaf"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_CORE_LINES 2271u   /* entries of trb_cl_text for user kernels: types, core, traversal */
+#define TRB_CL_LINES      3618u   /* all entries */
+#define TRB_CL_HASH       "4a2ace7263deaea2"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
@@ -3255,6 +3948,7 @@ static int trb_cl_load(trb_cl_api *api, trbvh_stats *stats) {
   X(BUILD,    "-DTRB_WITH_BOUNDS -DTRB_WITH_MORTON -DTRB_WITH_SORT -DTRB_WITH_HIERARCHY -DTRB_WITH_COLLAPSE -DTRB_WITH_OUTPUT") \
   X(SPLIT,    "-DTRB_WITH_BOUNDS -DTRB_WITH_SPLIT") \
   X(TREELETS, "-DTRB_WITH_TREELETS") \
+  X(MOVES,    "-DTRB_WITH_MOVES") \
   X(REFIT,    "-DTRB_WITH_REFIT -DTRB_WITH_OUTPUT") \
   X(TRACE,    "-DTRB_WITH_TRACE")
 
@@ -3270,14 +3964,20 @@ static int trb_cl_load(trb_cl_api *api, trbvh_stats *stats) {
   X(BUILD, sum_tiles, "bbu")          X(BUILD, scan_tiles, "bbu") \
   X(BUILD, build_blocks, "bbbbb")     X(BUILD, build_top, "bbb") \
   X(BUILD, build_chunks, "bbbbbbb")   X(BUILD, join_chunks, "bbbbbbbbbu") \
-  X(TREELETS, restructure_top, "bbbbu")                                   X(TREELETS, restructure_groups, "bbbbbbu") \
-  X(TREELETS, first_level, "bbbbu")   X(TREELETS, list_level, "bbbuu")    X(TREELETS, list_levels, "bbbuu") \
+  X(TREELETS, restructure_top, "bbbbu")                                   X(TREELETS, restructure_groups, "bbbbbbbuuu") \
+  X(TREELETS, first_level, "bbbbu")   X(TREELETS, list_level, "bbbuu")    X(TREELETS, list_levels, "bbbbuu") \
   X(TREELETS, restructure_level, "*bbbbtuuu")                             X(TREELETS, restructure_levels, "*bbbbtuu") \
-  X(BUILD, find_tasks, "bbbbbb")      X(BUILD, settle_groups, "bbbbbb")   X(BUILD, sum_tasks, "bb") \
+  X(MOVES, score, "bbbbb")            X(MOVES, choose_score, "bb") \
+  X(MOVES, count_candidates, "bbbbb") X(MOVES, list_candidates, "bbbbb")  X(MOVES, search, "bbbbu") \
+  X(MOVES, forget_refs, "bb")         X(MOVES, find_refs, "bbbbb")        X(MOVES, search_merges, "bbbbbu") \
+  X(MOVES, claim_gains, "bbbbb")      X(MOVES, claim_pairs, "bbbbb")      X(MOVES, stand_back, "bbbb") \
+  X(MOVES, follow, "bbbb")            X(MOVES, release, "bbbbb")          X(MOVES, move, "bbbbbu") \
+  X(MOVES, remake_level, "bbbbu")     X(MOVES, remake_levels, "bbbbu") \
+  X(BUILD, find_tasks, "bbbbbb")      X(BUILD, settle_groups, "bbbbbbb")  X(BUILD, sum_tasks, "bb") \
   X(BUILD, emit_top, "bbbbbbb")       X(BUILD, emit_tasks, "bbbbbbb") \
   X(BUILD, first_inner, "bbbbb")      X(BUILD, list_inner, "bbbbbbbu")    X(BUILD, list_rest, "bbbbbbbu") \
-  X(BUILD, count_inner, "bbbbbu")     X(BUILD, count_rest, "bbbbbu")      X(BUILD, sum_inner, "bbbb") \
-  X(BUILD, emit_root, "bbbb")         X(BUILD, emit_level, "bbbbbbbu") \
+  X(BUILD, count_inner, "bbbbbbu")    X(BUILD, count_rest, "bbbbbbu")     X(BUILD, sum_inner, "bbbbb") \
+  X(BUILD, emit_root, "bbbbb")        X(BUILD, emit_level, "bbbbbbbbu") \
   X(BUILD, triangles, "bbbbbu")       X(REFIT, triangles, "bbbbbu") \
   X(REFIT, first_refit, "bbb")        X(REFIT, list_refit, "bbbu") \
   X(REFIT, refit_leaves, "bbbbbu")    X(REFIT, refit_level, "bbbu") \
@@ -3803,10 +4503,9 @@ static void trb_cl_write(trb_cl *cl, trb_cl_mem buffer, const void *in, size_t s
     trb_cl_check(cl, cl->api.EnqueueWriteBuffer(cl->queue, buffer, 1, 0, size, in, 0, NULL, NULL), "clEnqueueWriteBuffer");
 }
 
-static void trb_cl_zero(trb_cl *cl, trb_cl_mem buffer, size_t size) {
-  const uint32_t zero = 0;
+static void trb_cl_fill(trb_cl *cl, trb_cl_mem buffer, uint32_t word, size_t size) {
   if (!cl->error && size)
-    trb_cl_check(cl, cl->api.EnqueueFillBuffer(cl->queue, buffer, &zero, sizeof zero, 0, size, 0, NULL, NULL),
+    trb_cl_check(cl, cl->api.EnqueueFillBuffer(cl->queue, buffer, &word, sizeof word, 0, size, 0, NULL, NULL),
                  "clEnqueueFillBuffer");
 }
 
@@ -3884,11 +4583,11 @@ static uint32_t trb_cl_spread(const trb_cl *cl, uint32_t n) {
   return cl->cpu ? trb_blocks(n, TRB_BLOCK) : TRB_MIN(trb_blocks(n, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX);
 }
 
-/* The words counts holds: tiles' counts, the sort's, twice those of hierarchy chunks. */
+/* The words counts holds: tiles' counts, the sort's, twice those of hierarchy chunks; and of scores. */
 static size_t trb_cl_count_words(const trb_cl_work *w) {
   const size_t tiles = w->tiles;
   return w->cl->cpu ? (size_t)trb_blocks(w->b->ref_max, TRB_SORT_BLOCK) * TRB_DIGITS + 2 * tiles
-                    : 256 * tiles + 2 * trb_blocks(w->b->ref_max, TRB_GPU_CHUNK) + 64;
+                    : 256 * tiles + 2 * trb_blocks(w->b->ref_max, TRB_GPU_CHUNK) + TRB_SCORES;
 }
 
 static void trb_cl_make_buffers(trb_cl_work *w) {
@@ -3948,6 +4647,8 @@ static void trb_cl_send_plan(trb_cl_work *w) {
   p->prim_count = b->input.count;
   p->boxes = b->input.boxes != NULL;
   p->split_max = b->split_max;
+  p->ref_max = b->ref_max;
+  p->reinsert_share = b->options.reinsert_share;
   p->index_size = b->input.indices ? b->input.index_size : 0;
   p->position_count = b->input.position_count;
   w->state = trb_cl_buffer(w->cl, TRB_CL_MEM_READ_WRITE | TRB_CL_MEM_COPY_HOST_PTR, sizeof *p, p);
@@ -4029,7 +4730,7 @@ static void trb_cl_build_hierarchy(trb_cl_work *w) {
     trb_cl_launch(cl, TRB_CL_BUILD_build_top, 1, w->state, w->nodes, w->ranges);
     return;
   }
-  trb_cl_zero(cl, w->sorted, (size_t)w->b->ref_max * sizeof(trb_wait));
+  trb_cl_fill(cl, w->sorted, 0, (size_t)w->b->ref_max * sizeof(trb_wait));
   trb_cl_launch(cl, TRB_CL_BUILD_build_chunks, chunks, w->state, w->keys, w->refs, w->nodes, w->sorted, from, counts);
   while (chunks > 1) {
     chunks = trb_blocks(chunks, TRB_GPU_CHUNKS);
@@ -4041,11 +4742,24 @@ static void trb_cl_build_hierarchy(trb_cl_work *w) {
   }
 }
 
-/* ---- Treelets ---- */
+/* ---- Lists by level ---- */
 /* Work-groups for one level on a GPU: of n nodes, and no more than two to this power. */
 static uint32_t trb_cl_level_groups(uint32_t level, uint32_t n, uint32_t group) {
   n = level < 31 ? TRB_MIN(n, 1u << level) : n;
   return trb_blocks(n, group);
+}
+
+/* On a GPU: lists the nodes of gamma references or more by level. */
+static void trb_cl_list_levels(trb_cl_work *w, uint32_t gamma) {
+  const uint32_t roots = w->b->ref_max / gamma;      /* of one level, at most */
+  trb_cl *cl = w->cl;
+  uint32_t level;
+  trb_cl_launch(cl, TRB_CL_TREELETS_first_level, 1, w->state, w->nodes, w->levels, w->lists, gamma);
+  for (level = 0; level < TRB_CL_WIDE; level++) {
+    uint32_t groups = TRB_MIN(trb_cl_level_groups(level, roots, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX);
+    trb_cl_launch(cl, TRB_CL_TREELETS_list_level, groups, w->nodes, w->levels, w->lists, gamma, level);
+  }
+  trb_cl_launch(cl, TRB_CL_TREELETS_list_levels, 1, w->state, w->nodes, w->levels, w->lists, gamma, TRB_CL_WIDE);
 }
 
 /* One round on a GPU, over the nodes of gamma to `largest` references. */
@@ -4053,12 +4767,7 @@ static void trb_cl_round(trb_cl_work *w, uint32_t gamma, uint32_t largest) {
   const uint32_t roots = w->b->ref_max / gamma;      /* of one level, at most */
   trb_cl *cl = w->cl;
   uint32_t level, begin;
-  trb_cl_launch(cl, TRB_CL_TREELETS_first_level, 1, w->state, w->nodes, w->levels, w->lists, gamma);
-  for (level = 0; level < TRB_CL_WIDE; level++) {
-    uint32_t groups = TRB_MIN(trb_cl_level_groups(level, roots, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX);
-    trb_cl_launch(cl, TRB_CL_TREELETS_list_level, groups, w->nodes, w->levels, w->lists, gamma, level);
-  }
-  trb_cl_launch(cl, TRB_CL_TREELETS_list_levels, 1, w->nodes, w->levels, w->lists, gamma, TRB_CL_WIDE);
+  trb_cl_list_levels(w, gamma);
   trb_cl_launch(cl, TRB_CL_TREELETS_restructure_levels, 1, w->state, w->nodes, w->levels, w->lists, largest, TRB_CL_WIDE);
   for (level = TRB_CL_WIDE; level-- > 0;)
     for (begin = 0; begin < roots && (level >= 31 || begin >> level == 0); begin += TRB_ROOTS_MAX) {
@@ -4068,20 +4777,103 @@ static void trb_cl_round(trb_cl_work *w, uint32_t gamma, uint32_t largest) {
     }
 }
 
+/* ---- Moves ---- */
+/* What a batch has found, on a GPU: conflicts, moves, and all nodes made anew. In marks are the largest gains. */
+static void trb_cl_move_gpu(trb_cl_work *w, uint32_t groups, uint32_t merges) {
+  const uint32_t inner = w->b->ref_max / 2;          /* of one level, at most */
+  trb_cl *cl = w->cl;
+  uint32_t level;
+  trb_cl_launch(cl, TRB_CL_MOVES_claim_gains, groups, w->state, w->nodes, w->keys, w->sorted, w->marks);
+  trb_cl_launch(cl, TRB_CL_MOVES_claim_pairs, groups, w->state, w->nodes, w->keys, w->sorted, w->marks);
+  trb_cl_launch(cl, TRB_CL_MOVES_stand_back, groups, w->state, w->nodes, w->keys, w->sorted);
+  if (!merges) trb_cl_launch(cl, TRB_CL_MOVES_follow, groups, w->state, w->nodes, w->keys, w->sorted);
+  trb_cl_launch(cl, TRB_CL_MOVES_release, groups, w->state, w->nodes, w->keys, w->sorted, w->marks);
+  trb_cl_launch(cl, TRB_CL_MOVES_move, groups, w->state, w->nodes, w->refs, w->keys, w->sorted, merges);
+  trb_cl_list_levels(w, 2);
+  trb_cl_launch(cl, TRB_CL_MOVES_remake_levels, 1, w->state, w->nodes, w->levels, w->lists, TRB_CL_WIDE);
+  for (level = TRB_CL_WIDE; level-- > 0;)
+    trb_cl_launch(cl, TRB_CL_MOVES_remake_level, TRB_MIN(trb_cl_level_groups(level, inner, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX),
+                  w->state, w->nodes, w->levels, w->lists, level);
+}
+
+static void trb_cl_move(trb_cl_work *w, uint32_t merges) {
+  const uint32_t most = TRB_MOVES_MAX(w->b->ref_max);
+  if (!w->cl->cpu) trb_cl_move_gpu(w, trb_cl_spread(w->cl, most), merges);
+  else trb_cl_launch(w->cl, TRB_CL_MOVES_move, 1, w->state, w->nodes, w->refs, w->keys, w->sorted, merges);
+}
+
+/* No pair has an owner. */
+static void trb_cl_start_moves(trb_cl_work *w) {
+  trb_cl_fill(w->cl, w->sorted, TRBVH_NONE, (size_t)w->b->ref_max * 4);
+  if (!w->cl->cpu) trb_cl_fill(w->cl, w->marks, 0, (size_t)w->b->ref_max * 4);
+}
+
+/* Work-groups that look at one of `most` moves in `each`. On a CPU they are heavy jobs: enough of them to be dealt out
+ * evenly, as there are seldom as many moves as there may be. */
+static uint32_t trb_cl_search_groups(const trb_cl_work *w, uint32_t most, uint32_t each) {
+  return w->cl->cpu ? TRB_MIN(trb_blocks(most, TRB_SEARCHES), 256u) * TRB_JOB_STEP : trb_cl_spread(w->cl, trb_blocks(most, each));
+}
+
+static trbvh_result trb_cl_reinsert(trb_cl_work *w) {
+  const uint32_t n = w->b->ref_max, groups = trb_cl_search_groups(w, TRB_MOVES_MAX(n), TRB_MOVE_BATCHES);
+  trb_cl *cl = w->cl;
+  trb_cl_mem histograms = cl->cpu ? w->ranges : w->counts, tiles = cl->cpu ? w->counts : w->places;
+  uint32_t batch;
+  if ((uint32_t)(w->b->options.reinsert_share * (float)n) == 0) return TRBVH_OK;
+  if (!cl->cpu) trb_cl_fill(cl, histograms, 0, TRB_SCORES * 4);
+  trb_cl_launch(cl, TRB_CL_MOVES_score, w->spread, w->state, w->nodes, w->keys, w->sorted, histograms);
+  trb_cl_launch(cl, TRB_CL_MOVES_choose_score, 1, w->state, histograms);
+  trb_cl_launch(cl, TRB_CL_MOVES_count_candidates, w->tiles, w->state, w->nodes, w->keys, w->sorted, tiles);
+  trb_cl_launch(cl, TRB_CL_BUILD_scan, 1, tiles, w->tiles);
+  trb_cl_launch(cl, TRB_CL_MOVES_list_candidates, w->tiles, w->state, w->nodes, w->keys, w->sorted, tiles);
+  trb_cl_start_moves(w);
+  for (batch = 0; batch <= TRB_MOVE_BATCHES; batch++) {
+    trb_cl_launch(cl, TRB_CL_MOVES_search, groups, w->state, w->nodes, w->keys, w->sorted, batch);
+    trb_cl_move(w, 0);
+    if (trb_stage(&w->b->runner, 0)) return TRBVH_CANCELLED;
+  }
+  return TRBVH_OK;
+}
+
+static trbvh_result trb_cl_unsplit(trb_cl_work *w) {
+  const uint32_t groups = trb_cl_search_groups(w, TRB_MOVES_MAX(w->b->ref_max), 1);
+  trb_cl *cl = w->cl;
+  int32_t pass;
+  uint32_t batch;
+  trb_cl_launch(cl, TRB_CL_MOVES_forget_refs, w->spread, w->state, w->refs);
+  trb_cl_launch(cl, TRB_CL_MOVES_find_refs, w->spread, w->state, w->nodes, w->refs, w->keys, w->sorted);
+  trb_cl_start_moves(w);
+  for (pass = 0; pass < w->b->options.unsplit_passes; pass++)
+    for (batch = 0; batch < TRB_MOVE_BATCHES; batch++) {
+      trb_cl_launch(cl, TRB_CL_MOVES_search_merges, groups, w->state, w->nodes, w->refs, w->keys, w->sorted, batch);
+      trb_cl_move(w, 1);
+      if (trb_stage(&w->b->runner, 0)) return TRBVH_CANCELLED;
+    }
+  return TRBVH_OK;
+}
+
+/* What comes before the rounds of a phase, as in C. */
+static trbvh_result trb_cl_make_moves(trb_cl_work *w, uint32_t phase) {
+  const int merges = w->b->split_max && w->b->options.unsplit_passes;
+  trbvh_result result = merges ? trb_cl_unsplit(w) : TRBVH_OK;
+  return !result && (merges || phase) ? trb_cl_reinsert(w) : result;
+}
+
+/* ---- Treelets ---- */
 static void trb_cl_find_tasks(trb_cl_work *w) {
   trb_cl_launch(w->cl, TRB_CL_BUILD_find_tasks, 1, w->state, w->nodes, w->keys, w->sorted, w->tasks, w->groups);
 }
 
-/* The order of C: the top of the tree in all rounds, then what is below it. */
+/* The rounds of a phase, in the order of C: all over the top of the tree, then all over what is below it. */
 static trbvh_result trb_cl_restructure(trb_cl_work *w) {
-  const uint32_t rounds = (uint32_t)w->b->options.treelet_rounds;
+  const uint32_t rounds = w->b->phase.rounds;
   trb_cl *cl = w->cl;
   uint32_t round, gamma;
   if (cl->cpu) {
     trb_cl_launch(cl, TRB_CL_TREELETS_restructure_top, 1, w->state, w->nodes, w->keys, w->sorted, rounds);
     trb_cl_find_tasks(w);
-    trb_cl_launch(cl, TRB_CL_TREELETS_restructure_groups, TRB_GROUPS_MAX(w->b->ref_max) * TRB_JOB_STEP, w->state, w->nodes, w->keys,
-                  w->sorted, w->tasks, w->groups, rounds);
+    trb_cl_launch(cl, TRB_CL_TREELETS_restructure_groups, TRB_GROUPS_MAX(w->b->ref_max) * TRB_JOB_STEP, w->state, w->nodes, w->refs,
+                  w->keys, w->sorted, w->tasks, w->groups, w->b->phase.gamma, rounds, w->b->phase.last);
     return TRBVH_OK;
   }
   for (round = 0; round < rounds && w->b->ref_max > TRB_TOP; round++) {
@@ -4089,7 +4881,7 @@ static trbvh_result trb_cl_restructure(trb_cl_work *w) {
     if (trb_stage(&w->b->runner, 0.05f)) return TRBVH_CANCELLED;
   }
   if (w->b->ref_max > TRB_BLOCK) trb_cl_find_tasks(w);         /* for the depth bound above them */
-  for (round = 0, gamma = TRB_TREELET; round < rounds && gamma <= TRB_MIN(TRB_BLOCK, w->b->ref_max); round++, gamma *= 2) {
+  for (round = 0, gamma = w->b->phase.gamma; round < rounds && gamma <= TRB_MIN(TRB_BLOCK, w->b->ref_max); round++, gamma *= 2) {
     trb_cl_round(w, gamma, TRB_BLOCK);
     if (trb_stage(&w->b->runner, 0.05f)) return TRBVH_CANCELLED;
   }
@@ -4104,8 +4896,8 @@ static void trb_cl_count_tree(trb_cl_work *w) {
   if (cl->cpu) {
     if (!w->b->options.treelet_rounds) {
       trb_cl_find_tasks(w);
-      trb_cl_launch(cl, TRB_CL_BUILD_settle_groups, TRB_GROUPS_MAX(w->b->ref_max) * TRB_JOB_STEP, w->state, w->nodes, w->keys, w->sorted,
-                    w->tasks, w->groups);
+      trb_cl_launch(cl, TRB_CL_BUILD_settle_groups, TRB_GROUPS_MAX(w->b->ref_max) * TRB_JOB_STEP, w->state, w->nodes, w->refs,
+                    w->keys, w->sorted, w->tasks, w->groups);
     }
     trb_cl_launch(cl, TRB_CL_BUILD_sum_tasks, 1, w->state, w->tasks);
     return;
@@ -4116,11 +4908,11 @@ static void trb_cl_count_tree(trb_cl_work *w) {
                   w->state, w->nodes, w->keys, w->sorted, w->levels, w->lists, w->marks, level);
   trb_cl_launch(cl, TRB_CL_BUILD_list_rest, 1, w->state, w->nodes, w->keys, w->sorted, w->levels, w->lists, w->marks,
                 TRB_CL_WIDE);
-  trb_cl_launch(cl, TRB_CL_BUILD_count_rest, 1, w->state, w->nodes, w->levels, w->lists, w->places, TRB_CL_WIDE);
+  trb_cl_launch(cl, TRB_CL_BUILD_count_rest, 1, w->state, w->nodes, w->refs, w->levels, w->lists, w->places, TRB_CL_WIDE);
   for (level = TRB_CL_WIDE; level-- > 0;)
     trb_cl_launch(cl, TRB_CL_BUILD_count_inner, TRB_MIN(trb_cl_level_groups(level, inner, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX),
-                  w->state, w->nodes, w->levels, w->lists, w->places, level);
-  trb_cl_launch(cl, TRB_CL_BUILD_sum_inner, 1, w->state, w->nodes, w->levels, w->places);
+                  w->state, w->nodes, w->refs, w->levels, w->lists, w->places, level);
+  trb_cl_launch(cl, TRB_CL_BUILD_sum_inner, 1, w->state, w->nodes, w->refs, w->levels, w->places);
 }
 
 /* Into the buffers for the result. */
@@ -4133,11 +4925,11 @@ static void trb_cl_emit_tree(trb_cl_work *w) {
                   w->out_nodes, w->out_prims);
     return;
   }
-  trb_cl_launch(cl, TRB_CL_BUILD_emit_root, 1, w->state, w->nodes, w->out_nodes, w->out_prims);
+  trb_cl_launch(cl, TRB_CL_BUILD_emit_root, 1, w->state, w->nodes, w->refs, w->out_nodes, w->out_prims);
   for (level = 0; level < w->plan.max_depth; level++)
     trb_cl_launch(cl, TRB_CL_BUILD_emit_level,
                   TRB_MIN(trb_cl_level_groups(level, w->b->ref_max / 2, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX),
-                  w->state, w->nodes, w->levels, w->lists, w->places, w->out_nodes, w->out_prims, level);
+                  w->state, w->nodes, w->refs, w->levels, w->lists, w->places, w->out_nodes, w->out_prims, level);
 }
 
 static void trb_cl_make_triangles(trb_cl_work *w) {
@@ -4167,6 +4959,8 @@ static trbvh_result trb_cl_end_stage(trb_cl_work *w, float share, double *ms, do
 static trbvh_result trb_cl_run_to_counts(trb_cl_work *w) {
   const trb_build *b = w->b;
   const trb_plan *p = &w->plan;
+  const uint32_t phases = trb_phases(b);
+  uint32_t phase;
   trbvh_result result;
   double start = trb_ms();
   trb_cl_make_buffers(w);
@@ -4177,9 +4971,14 @@ static trbvh_result trb_cl_run_to_counts(trb_cl_work *w) {
   TRB_CL_STAGE(0.05f, ms_morton, trb_cl_make_keys(w))
   TRB_CL_STAGE(0.1f, ms_sort, trb_cl_sort_keys(w))
   TRB_CL_STAGE(0.1f, ms_hierarchy, trb_cl_build_hierarchy(w))
-  if (b->options.treelet_rounds) { TRB_CL_STAGE(0.1f, ms_treelets, result = trb_cl_restructure(w)) }
+  for (phase = 0; phase < phases; phase++) {
+    trb_start_phase(w->b, phase);
+    TRB_CL_STAGE(0, ms_moves, result = trb_cl_make_moves(w, phase))
+    if (b->phase.rounds) { TRB_CL_STAGE(0.1f / (float)phases, ms_treelets, result = trb_cl_restructure(w)) }
+  }
   TRB_CL_STAGE(0.1f, ms_collapse, (trb_cl_count_tree(w), trb_cl_read(w->cl, w->state, &w->plan, sizeof w->plan)))
   if (result) return result;
+  if (p->too_deep) return trb_fail(w->b, TRBVH_DEVICE_ERROR, "the tree is too deep for this device", 0, 0, 0);
   if (p->skipped > b->input.count || p->prims < b->input.count - p->skipped || p->prims > p->ref_count ||
       p->ref_count > b->ref_max || p->leaves > p->prims || (p->prims == 0) != (p->leaves == 0) ||
       p->max_depth > TRBVH_MAX_DEPTH)

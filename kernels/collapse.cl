@@ -11,19 +11,20 @@ static void trb_emit_padding(__global trbvh_node *out) {
 /* One work-item. */
 TRB_KERNEL trb_k_find_tasks(__global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys, __global ulong *sorted,
                             __global trb_task *tasks, __global trb_group *groups) {
-  const trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);
+  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, keys, sorted);
   float sah = 0;
   if (TRB_LOCAL_ID != 0) return;
-  plan->tasks = plan->ref_count ? trb_find_tasks(&c, 0, tasks, &sah) : 0;
+  plan->tasks = plan->ref_count && !plan->too_deep ? trb_find_tasks(&c, 0, tasks, &sah) : 0;
   plan->groups = trb_find_groups(tasks, plan->tasks, groups);
   plan->sah = sah;
   plan->root_area = trb_sah_term(nodes[0], 1);
 }
 
 #ifdef TRB_CPU
-TRB_KERNEL trb_k_settle_groups(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
-                               __global ulong *sorted, __global trb_task *tasks, const __global trb_group *groups) {
-  const trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);
+TRB_KERNEL trb_k_settle_groups(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trbvh_node *refs,
+                               __global ulong *keys, __global ulong *sorted, __global trb_task *tasks,
+                               const __global trb_group *groups) {
+  const trb_collapser c = trb_plan_collapser(plan, nodes, refs, keys, sorted);
   uint i;
   TRB_FOR_JOBS(i, plan->groups) trb_settle_group(&c, tasks, groups[i]);
 }
@@ -45,7 +46,7 @@ TRB_KERNEL trb_k_sum_tasks(__global trb_plan *plan, const __global trb_task *tas
 
 TRB_KERNEL trb_k_emit_top(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
                           __global ulong *sorted, __global trb_task *tasks, __global trbvh_node *out, __global uint *prims) {
-  const trb_collapser c = trb_plan_emitter(plan, nodes, keys, sorted, out, prims);
+  const trb_collapser c = trb_plan_emitter(plan, nodes, 0, keys, sorted, out, prims);
   trb_emit_padding(out);
   trb_emit_top(&c, tasks, plan->tasks);
 }
@@ -53,7 +54,7 @@ TRB_KERNEL trb_k_emit_top(const __global trb_plan *plan, __global trbvh_node *no
 TRB_KERNEL trb_k_emit_tasks(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
                             __global ulong *sorted, const __global trb_task *tasks, __global trbvh_node *out,
                             __global uint *prims) {
-  const trb_collapser c = trb_plan_emitter(plan, nodes, keys, sorted, out, prims);
+  const trb_collapser c = trb_plan_emitter(plan, nodes, 0, keys, sorted, out, prims);
   uint i;
   TRB_FOR_JOBS(i, plan->tasks) trb_emit_task(&c, tasks[i]);
 }
@@ -61,7 +62,7 @@ TRB_KERNEL trb_k_emit_tasks(const __global trb_plan *plan, __global trbvh_node *
 /* Inner nodes are listed level by level; their sums go from the bottom up, their places from the top down. */
 TRB_CORE uint trb_count_prims(const trb_collapser *c, trbvh_node leaf) {
   uint prims[TRB_MAX_LEAF];
-  return c->split ? trb_leaf_prims(c, leaf, prims) : trb_count(leaf.count);
+  return c->refs ? trb_leaf_prims(c, leaf, prims) : trb_count(leaf.count);
 }
 
 /* Writes a leaf whose primitives begin at `first`; returns how many they are. */
@@ -80,7 +81,7 @@ TRB_KERNEL trb_k_first_inner(const __global trb_plan *plan, const __global trbvh
   uint i;
   for (i = TRB_LOCAL_ID; i < TRB_GPU_LEVELS; i += TRB_GROUP) levels[i].first = levels[i].count = 0;
   TRB_SYNC();
-  if (TRB_LOCAL_ID != 0 || plan->ref_count == 0) return;
+  if (TRB_LOCAL_ID != 0 || plan->ref_count == 0 || plan->too_deep) return;
   list[0] = first_refs[0] = 0;
   levels[0].count = !trb_is_leaf(nodes[0].count);
 }
@@ -113,7 +114,7 @@ TRB_KERNEL trb_k_list_inner(const __global trb_plan *plan, __global trbvh_node *
                             __global ulong *sorted, __global trb_level *levels, __global uint *list,
                             __global uint *first_refs, uint level) {
   __local uint space[2];
-  const trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);
+  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, keys, sorted);
   trb_list_inner(&c, levels, list, first_refs, level, (uint)get_global_id(0), (uint)get_global_size(0), space);
 }
 
@@ -122,7 +123,7 @@ TRB_KERNEL trb_k_list_rest(const __global trb_plan *plan, __global trbvh_node *n
                            __global ulong *sorted, __global trb_level *levels, __global uint *list,
                            __global uint *first_refs, uint level) {
   __local uint space[2];
-  const trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);
+  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, keys, sorted);
   for (; level + 1 < TRB_GPU_LEVELS && levels[level].count; level++) {
     trb_list_inner(&c, levels, list, first_refs, level, TRB_LOCAL_ID, TRB_GROUP, space);
     TRB_SYNC();
@@ -152,18 +153,20 @@ static void trb_count_inner(const trb_collapser *c, __global trb_place *places, 
   places[node.first / 2] = sum;
 }
 
-TRB_KERNEL trb_k_count_inner(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,
-                             const __global uint *list, __global trb_place *places, uint level) {
-  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0);
+TRB_KERNEL trb_k_count_inner(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trbvh_node *refs,
+                             const __global trb_level *levels, const __global uint *list, __global trb_place *places,
+                             uint level) {
+  const trb_collapser c = trb_plan_collapser(plan, nodes, refs, 0, 0);
   const uint first = levels[level].first, count = levels[level].count;
   uint i;
   TRB_FOR(i, count) trb_count_inner(&c, places, list[first + i]);
 }
 
 /* One work-group: all levels from the lowest one up to this. */
-TRB_KERNEL trb_k_count_rest(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,
-                            const __global uint *list, __global trb_place *places, uint level) {
-  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0);
+TRB_KERNEL trb_k_count_rest(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trbvh_node *refs,
+                            const __global trb_level *levels, const __global uint *list, __global trb_place *places,
+                            uint level) {
+  const trb_collapser c = trb_plan_collapser(plan, nodes, refs, 0, 0);
   uint lowest = level, i;
   while (lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;
   for (lowest++; lowest-- > level;) {
@@ -174,13 +177,13 @@ TRB_KERNEL trb_k_count_rest(const __global trb_plan *plan, __global trbvh_node *
 }
 
 /* One work-item is enough. */
-TRB_KERNEL trb_k_sum_inner(__global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,
-                           __global trb_place *places) {
-  const trb_collapser c = trb_plan_collapser(plan, nodes, 0, 0);
+TRB_KERNEL trb_k_sum_inner(__global trb_plan *plan, __global trbvh_node *nodes, const __global trbvh_node *refs,
+                           const __global trb_level *levels, __global trb_place *places) {
+  const trb_collapser c = trb_plan_collapser(plan, nodes, refs, 0, 0);
   uint depth = 0;
   if (TRB_LOCAL_ID != 0) return;
   plan->leaves = plan->prims = plan->max_depth = 0;
-  if (plan->ref_count == 0) return;
+  if (plan->ref_count == 0 || plan->too_deep) return;
   plan->root_area = trb_sah_term(nodes[0], 1);
   if (trb_is_leaf(nodes[0].count)) {
     plan->leaves = 1;
@@ -219,19 +222,19 @@ static void trb_place_children(const trb_collapser *c, __global trb_place *place
   }
 }
 
-TRB_KERNEL trb_k_emit_root(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *out,
-                           __global uint *prims) {
-  const trb_collapser c = trb_plan_emitter(plan, nodes, 0, 0, out, prims);
+TRB_KERNEL trb_k_emit_root(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trbvh_node *refs,
+                           __global trbvh_node *out, __global uint *prims) {
+  const trb_collapser c = trb_plan_emitter(plan, nodes, refs, 0, 0, out, prims);
   if (TRB_LOCAL_ID != 0) return;
   trb_emit_padding(out);
   if (trb_is_leaf(nodes[0].count)) trb_emit_leaf(&c, nodes[0], 0, 0);
   else trb_emit_inner(&c, nodes[0], 0, 1);
 }
 
-TRB_KERNEL trb_k_emit_level(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,
-                            const __global uint *list, __global trb_place *places, __global trbvh_node *out,
-                            __global uint *prims, uint level) {
-  const trb_collapser c = trb_plan_emitter(plan, nodes, 0, 0, out, prims);
+TRB_KERNEL trb_k_emit_level(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trbvh_node *refs,
+                            const __global trb_level *levels, const __global uint *list, __global trb_place *places,
+                            __global trbvh_node *out, __global uint *prims, uint level) {
+  const trb_collapser c = trb_plan_emitter(plan, nodes, refs, 0, 0, out, prims);
   const uint first = levels[level].first, count = levels[level].count;
   uint i;
   TRB_FOR(i, count) trb_place_children(&c, places, list[first + i]);

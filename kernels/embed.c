@@ -22,6 +22,7 @@ static const struct { const char *name, *guard; } sources[] = {
   { "kernels/sort.cl",      "#ifdef TRB_WITH_SORT" },
   { "kernels/hierarchy.cl", "#ifdef TRB_WITH_HIERARCHY" },
   { "kernels/treelets.cl",  "#ifdef TRB_WITH_TREELETS" },
+  { "kernels/moves.cl",     "#ifdef TRB_WITH_MOVES" },
   { "kernels/collapse.cl",  "#ifdef TRB_WITH_COLLAPSE" },
   { "kernels/output.cl",    "#ifdef TRB_WITH_OUTPUT" },
   { "kernels/refit.cl",     "#ifdef TRB_WITH_REFIT" },

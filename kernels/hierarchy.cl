@@ -71,7 +71,9 @@ TRB_KERNEL trb_k_build_chunks(const __global trb_plan *plan, const __global ulon
   const uint id = TRB_LOCAL_ID, first = TRB_GROUP_ID * TRB_GPU_CHUNK, end = min(curve.count, first + TRB_GPU_CHUNK);
   uint i, k, done = 0, kept = 0, total;
   for (i = first + id; i < end; i += TRB_GROUP) {
-    const trbvh_node ref = refs[trb_key_ref(keys[i], curve.form)];
+    const uint number = trb_key_ref(keys[i], curve.form);
+    trbvh_node ref = refs[number];
+    ref.first = number;                              /* the primitive takes its place in the end */
     trb_hang(&curve, nodes, waits, trb_reference(ref, costs), i, i);
   }
   for (;;) {

@@ -73,25 +73,27 @@ static trb_mesh trb_plan_mesh(const __global trb_plan *plan, const __global char
 /* Slots of references are gaps where a primitive is invalid, or has used fewer splits than it had. */
 static bool trb_has_gaps(const __global trb_plan *plan) { return plan->ref_count != plan->slots; }
 
-/* What the collapse needs to know; keys and sorted are scratch memory by then, for those who need some. */
-static trb_collapser trb_plan_collapser(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
-                                        __global ulong *sorted) {
+/* What the collapse needs to know; keys and sorted are scratch memory by then, for those who need some, as refs is for
+ * those who look into leaves. */
+static trb_collapser trb_plan_collapser(const __global trb_plan *plan, __global trbvh_node *nodes,
+                                        const __global trbvh_node *refs, __global ulong *keys, __global ulong *sorted) {
   trb_collapser c;
   c.nodes = nodes;
-  c.words = trb_split_words(keys, sorted, plan->ref_count);
+  c.words = trb_split_words(keys, sorted, plan->ref_max);
   c.costs = plan->costs;
   c.cost_node = plan->cost_node;
   c.cost_prim = plan->cost_prim;
-  c.split = plan->split_max != 0;
+  c.refs = plan->split_max ? refs : 0;
   c.out = 0;
   c.prims = 0;
   return c;
 }
 
 /* The same once the result is allocated. */
-static trb_collapser trb_plan_emitter(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
-                                      __global ulong *sorted, __global trbvh_node *out, __global uint *prims) {
-  trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);
+static trb_collapser trb_plan_emitter(const __global trb_plan *plan, __global trbvh_node *nodes,
+                                      const __global trbvh_node *refs, __global ulong *keys, __global ulong *sorted,
+                                      __global trbvh_node *out, __global uint *prims) {
+  trb_collapser c = trb_plan_collapser(plan, nodes, refs, keys, sorted);
   c.out = out;
   c.prims = prims;
   return c;

@@ -5,18 +5,19 @@
 #ifdef TRB_CPU
 TRB_KERNEL trb_k_restructure_top(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
                                  __global ulong *sorted, uint rounds) {
-  if (plan->ref_count) trb_restructure_top(nodes, trb_split_words(keys, sorted, plan->ref_count), rounds, plan->costs);
+  if (plan->ref_count) trb_restructure_top(nodes, trb_split_words(keys, sorted, plan->ref_max), rounds, plan->costs);
 }
 
-/* And settles them, while they are in the caches. */
-TRB_KERNEL trb_k_restructure_groups(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
-                                    __global ulong *sorted, __global trb_task *tasks, const __global trb_group *groups,
-                                    uint rounds) {
-  const trb_collapser c = trb_plan_collapser(plan, nodes, keys, sorted);
+/* And settles them after the last rounds, while they are in the caches. */
+TRB_KERNEL trb_k_restructure_groups(const __global trb_plan *plan, __global trbvh_node *nodes,
+                                    const __global trbvh_node *refs, __global ulong *keys, __global ulong *sorted,
+                                    __global trb_task *tasks, const __global trb_group *groups, uint gamma, uint rounds,
+                                    uint last) {
+  const trb_collapser c = trb_plan_collapser(plan, nodes, refs, keys, sorted);
   uint i;
   TRB_FOR_JOBS(i, plan->groups) {
-    trb_restructure_group(&c, tasks, groups[i], rounds);
-    trb_settle_group(&c, tasks, groups[i]);
+    trb_restructure_group(&c, tasks, groups[i], gamma, rounds);
+    if (last) trb_settle_group(&c, tasks, groups[i]);
   }
 }
 #else
@@ -27,7 +28,7 @@ TRB_KERNEL trb_k_first_level(const __global trb_plan *plan, const __global trbvh
   uint i;
   for (i = TRB_LOCAL_ID; i < TRB_GPU_LEVELS; i += TRB_GROUP) levels[i].first = levels[i].count = 0;
   TRB_SYNC();
-  if (TRB_LOCAL_ID != 0 || plan->ref_count == 0) return;
+  if (TRB_LOCAL_ID != 0 || plan->ref_count == 0 || plan->too_deep) return;
   list[0] = 0;
   levels[0].count = trb_count(nodes[0].count) >= gamma;
 }
@@ -55,14 +56,15 @@ TRB_KERNEL trb_k_list_level(const __global trbvh_node *nodes, __global trb_level
   trb_list_level(nodes, levels, list, level, gamma, (uint)get_global_id(0), (uint)get_global_size(0), space);
 }
 
-/* One work-group: all levels from this one on. */
-TRB_KERNEL trb_k_list_levels(const __global trbvh_node *nodes, __global trb_level *levels, __global uint *list, uint gamma,
-                             uint level) {
+/* One work-group: all levels from this one on. A tree with more than there is room for is given up. */
+TRB_KERNEL trb_k_list_levels(__global trb_plan *plan, const __global trbvh_node *nodes, __global trb_level *levels,
+                             __global uint *list, uint gamma, uint level) {
   __local uint space[2];
   for (; level + 1 < TRB_GPU_LEVELS && levels[level].count; level++) {
     trb_list_level(nodes, levels, list, level, gamma, TRB_LOCAL_ID, TRB_GROUP, space);
     TRB_SYNC();
   }
+  if (TRB_LOCAL_ID == 0 && levels[TRB_GPU_LEVELS - 1].count) plan->too_deep = 1;
 }
 
 /* Not those of more than `largest` references. */
