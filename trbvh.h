@@ -2131,7 +2131,7 @@ TRB_CORE void trb_search_merge(const trb_mover *m, trbvh_u32 i, trbvh_u32 slots)
 
 /* Takes a leaf away, its sibling getting their parent's place, and grows another one. Afterwards the move tells below
  * which nodes something has changed. */
-TRB_CORE void trb_merge(const trb_mover *m, TRB_GLOBAL trb_move *move) {
+TRB_CORE void trb_merge_refs(const trb_mover *m, TRB_GLOBAL trb_move *move) {
   const trbvh_u32 pair = move->node & ~1u, parent = m->parents[pair / 2];
   const trbvh_node gone = m->nodes[move->node];
   trbvh_node grown = trb_join(m->nodes[move->target], gone);
@@ -3769,7 +3769,7 @@ static int trb_unsplit(trb_build *b) {
       if (trb_run_moves(b, trb_blocks(b->move_count, TRB_SEARCHES), trb_search_merges_job)) return 1;
       trb_choose_moves(&m, b->move_count);
       for (i = 0; i < b->move_count; i++)
-        if (m.moves[i].gain > 0) trb_merge(&m, &m.moves[i]);
+        if (m.moves[i].gain > 0) trb_merge_refs(&m, &m.moves[i]);
       trb_remake_moved(&m, b->move_count);
     }
   return 0;

@@ -1776,7 +1776,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "\n",
-  "TRB_CORE void trb_merge(const trb_mover *m, TRB_GLOBAL trb_move *move) {\n",
+  "TRB_CORE void trb_merge_refs(const trb_mover *m, TRB_GLOBAL trb_move *move) {\n",
   "  const trbvh_u32 pair = move->node & ~1u, parent = m->parents[pair / 2];\n",
   "  const trbvh_node gone = m->nodes[move->node];\n",
   "  trbvh_node grown = trb_join(m->nodes[move->target], gone);\n",
@@ -3259,7 +3259,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "TRB_CORE void trb_make_move(const trb_mover *m, uint i, uint merges) {\n",
   "  if (!(m->moves[i].gain > 0)) return;\n",
-  "  if (merges) trb_merge(m, &m->moves[i]);\n",
+  "  if (merges) trb_merge_refs(m, &m->moves[i]);\n",
   "  else trb_reinsert(m, &m->moves[i]);\n",
   "}\n",
   "\n",
@@ -3738,7 +3738,7 @@ static const char *const trb_cl_text[] = {
 };
 #define TRB_CL_CORE_LINES 2271u   /* entries of trb_cl_text for user kernels: types, core, traversal */
 #define TRB_CL_LINES      3618u   /* all entries */
-#define TRB_CL_HASH       "4a2ace7263deaea2"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_HASH       "eb0f8185f15cd644"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {

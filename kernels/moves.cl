@@ -147,7 +147,7 @@ TRB_KERNEL trb_k_search_merges(const __global trb_plan *plan, __global trbvh_nod
 /* ---- Conflicts, and the moves ---- */
 TRB_CORE void trb_make_move(const trb_mover *m, uint i, uint merges) {
   if (!(m->moves[i].gain > 0)) return;
-  if (merges) trb_merge(m, &m->moves[i]);
+  if (merges) trb_merge_refs(m, &m->moves[i]);
   else trb_reinsert(m, &m->moves[i]);
 }
 
