@@ -1343,6 +1343,240 @@ static void test_split_budget(void) {
   free(soup);
 }
 
+// >>moves
+/* The sum of the inner nodes' half areas below `node`, and its box, as if `gone` were taken out and `target` had it as a
+ * sibling; TRBVH_NONE for neither. All in double. */
+typedef struct double_box { double min[3], max[3]; } double_box;
+static double_box join_boxes(double_box a, double_box b) {
+  int k;
+  for (k = 0; k < 3; k++) {
+    if (b.min[k] < a.min[k]) a.min[k] = b.min[k];
+    if (b.max[k] > a.max[k]) a.max[k] = b.max[k];
+  }
+  return a;
+}
+static double box_area(double_box b) {
+  const double x = b.max[0] - b.min[0], y = b.max[1] - b.min[1], z = b.max[2] - b.min[2];
+  return x * y + z * (x + y);
+}
+static double_box box_of(const trbvh_node *n) {
+  double_box b;
+  int k;
+  for (k = 0; k < 3; k++) { b.min[k] = n->min[k]; b.max[k] = n->max[k]; }
+  return b;
+}
+static double area_after(const trbvh_node *nodes, uint32_t node, uint32_t gone, uint32_t target, double_box *box) {
+  const trbvh_node *n = &nodes[node];
+  double sum = 0;
+  if (trb_count(n->count) == 1) {
+    *box = box_of(n);
+  } else if (gone != TRBVH_NONE && n->first == (gone & ~1u)) {
+    sum = area_after(nodes, gone ^ 1u, gone, target, box);           /* the parent vanishes */
+  } else {
+    double_box right;
+    sum = area_after(nodes, n->first, gone, target, box) + area_after(nodes, n->first + 1, gone, target, &right);
+    *box = join_boxes(*box, right);
+    sum += box_area(*box);
+  }
+  if (node == target) {
+    *box = join_boxes(*box, box_of(&nodes[gone]));
+    sum += box_area(*box);
+  }
+  return sum;
+}
+static int is_below(const trb_mover *m, uint32_t node, uint32_t above) {
+  while (node != above && node) node = m->parents[node / 2];
+  return node == above;
+}
+/* Nothing below a node that is better as a leaf is a place to go to. */
+static int is_a_place(const trb_mover *m, uint32_t target, uint32_t node) {
+  const uint32_t parent = m->parents[node / 2];
+  uint32_t at = target;
+  if (target < 2 || target == parent || target == (node ^ 1u) || is_below(m, target, node)) return 0;
+  while (at) {
+    at = m->parents[at / 2];
+    if (trb_is_leaf(m->nodes[at].count) && !is_below(m, node, at)) return 0;
+  }
+  return 1;
+}
+static trb_mover start_moving(trb_build *b) {
+  const trb_mover m = trb_build_mover(b);
+  uint32_t pair;
+  m.parents[0] = m.parents[b->nodes[0].first / 2] = 0;
+  for (pair = 1; pair < b->ref_count; pair++) trb_score_pair(&m, pair);
+  return m;
+}
+
+/* The place that is found has the gain that it says, and no other one is better: all are tried. */
+static void test_places(void) {
+  trbvh_node boxes[40];
+  float memory[40 * 6];
+  uint32_t kind, n, leaf, node, target, places = 0;
+  for (kind = 0; kind < 5; kind++)
+    for (n = 3; n <= 40; n += kind == 0 ? 1 : 7)
+      for (leaf = 1; leaf <= 8; leaf += 7) {
+        trbvh_options o;
+        trbvh_geometry g;
+        trb_build b;
+        trb_mover m;
+        double before, inside;
+        double_box box;
+        CONTEXT("%u boxes of kind %u, leaves of %u", n, kind, leaf);
+        memset(&o, 0, sizeof o);
+        o.max_leaf = leaf;
+        some_boxes(boxes, n, kind);
+        g = geometry_of_boxes(boxes, n, memory);
+        build_hierarchy(&b, &g, &o);
+        m = start_moving(&b);
+        before = area_after(b.nodes, 0, TRBVH_NONE, TRBVH_NONE, &box);
+        for (node = 2; node < 2 * n; node++) {
+          const double unit = 1e-5 * before + 1e-30;
+          double best = 0;
+          trb_move move;
+          if (m.parents[node / 2] == 0) continue;
+          inside = area_after(b.nodes, node, TRBVH_NONE, TRBVH_NONE, &box);
+          for (target = 2; target < 2 * n; target++) {
+            double gain;
+            if (!is_a_place(&m, target, node)) continue;
+            gain = before - inside - area_after(b.nodes, 0, node, target, &box);
+            best = TRB_MAX(gain, best);
+          }
+          move = trb_find_place(&m, node, 1e-30f);
+          CHECK_MSG(move.gain >= best - unit, "node %u: gains %g, %g is possible", node, (double)move.gain, best);
+          if (!(move.gain > 0)) continue;
+          places++;
+          CHECK_MSG(is_a_place(&m, move.target, node), "node %u cannot go to %u", node, move.target);
+          CHECK_MSG(is_below(&m, node, move.above) && is_below(&m, move.target, move.above), "%u is not above", move.above);
+          best = before - inside - area_after(b.nodes, 0, node, move.target, &box);
+          CHECK_MSG(fabs(best - move.gain) <= unit, "node %u: gains %g, not %g", node, best, (double)move.gain);
+        }
+        end_build(&b);
+      }
+  CHECK_MSG(places > 500, "only %u moves", places);
+}
+
+/* After reinsertion and unsplitting: a tree, all of whose nodes are what their children make them; every primitive in
+ * it; no pair left with an owner; and less area. */
+static uint32_t check_moved(const trb_build *b, uint32_t node, unsigned char *prims) {
+  const trbvh_node *n = &b->nodes[node];
+  trbvh_node made;
+  uint32_t count;
+  if (trb_is_single(n->count)) {
+    const uint32_t prim = b->refs ? b->refs[n->first].first : n->first;
+    if (b->refs) CHECK_MSG(b->refs[n->first].count != TRBVH_NONE, "reference %u was taken away", n->first);
+    prims[prim] = 1;
+    return 1;
+  }
+  count = check_moved(b, n->first, prims) + check_moved(b, n->first + 1, prims);
+  made = trb_parent(b->nodes[n->first], b->nodes[n->first + 1], n->first, b->costs);
+  CHECK_MSG(!memcmp(&made, n, sizeof made), "node %u is not what its children make it", node);
+  return count;
+}
+static void test_moved_trees(void) {
+  trbvh_node *boxes = (trbvh_node *)xmalloc(BOXES * sizeof *boxes);
+  float *memory = (float *)xmalloc(BOXES * 36);
+  unsigned char *prims = (unsigned char *)xmalloc(BOXES);
+  uint32_t kind, i, n, passed;
+  for (kind = 0; kind < 10; kind++) {
+    trbvh_options o;
+    trbvh_geometry g;
+    trb_build b;
+    double before, after;
+    double_box box;
+    CONTEXT("kind %u", kind);
+    memset(&o, 0, sizeof o);
+    o.quality = TRBVH_QUALITY_HIGH;
+    o.reinsert_share = 0.25f;
+    n = kind < 5 ? BOXES : BOXES / 3;
+    if (kind < 5) {
+      some_boxes(boxes, n, kind);
+      g = geometry_of_boxes(boxes, n, memory);
+    } else {
+      some_triangles(memory, n, 0);
+      for (i = 0; i < 9 * n; i++)                    /* long ones, whose splits do not all pay */
+        if (i % 9 >= 6) memory[i] += (i % 9 == 5 + (kind - 4) % 3) * 0.3f;
+      g = geometry_of_soup(memory, n);
+      o.split_budget = 0.1f * (float)(kind - 4);
+    }
+    build_hierarchy(&b, &g, &o);
+    b.runner.options = &b.options;
+    before = area_after(b.nodes, 0, TRBVH_NONE, TRBVH_NONE, &box);
+    CHECK(!trb_unsplit(&b));
+    for (i = 0, passed = 0; b.refs && i < b.slot_count; i++)
+      passed += b.refs[i].first != TRBVH_NONE && b.refs[i].count == TRBVH_NONE;
+    if (b.refs) CHECK_MSG(passed > 0, "all splits pay");
+    CHECK(!trb_reinsert_candidates(&b));
+    memset(prims, 0, n);
+    CHECK_MSG(check_moved(&b, 0, prims) == b.ref_count - passed, "%u references, %u taken back", b.ref_count, passed);
+    CHECK(trb_count(b.nodes[0].count) == b.ref_count - passed);
+    for (i = 0; i < n; i++) CHECK_MSG(prims[i], "primitive %u is lost", i);
+    for (i = 0; i < b.ref_count; i++) CHECK_MSG(trb_build_mover(&b).owners[i] == TRBVH_NONE, "pair %u is owned", i);
+    after = area_after(b.nodes, 0, TRBVH_NONE, TRBVH_NONE, &box);
+    CHECK_MSG(after <= before && (after < before || (kind >= 2 && kind < 5)), "%g before, %g after", before, after);
+    end_build(&b);
+  }
+  free(boxes);
+  free(memory);
+  free(prims);
+}
+
+/* Two subtrees that would each go into the other one: the move that gains more, or the first one, happens alone. And of
+ * two moves next to the same target, too. */
+static void test_conflicts(void) {
+  static const float gains[][2] = {{2, 1}, {1, 2}, {1, 1}};
+  static const uint32_t moves[][4] = {{8, 14, 10, 12}, {8, 15, 10, 13}, {12, 10, 9, 11}, {12, 14, 13, 15}};   /* nodes, targets */
+  trbvh_node boxes[8];
+  float memory[8 * 6];
+  unsigned char prims[8];
+  uint32_t at, k, i;
+  for (at = 0; at < sizeof moves / sizeof moves[0]; at++)
+    for (k = 0; k < 3; k++) {
+      const uint32_t winner = gains[k][1] > gains[k][0];
+      trbvh_options o;
+      trbvh_geometry g;
+      trb_build b;
+      trb_mover m;
+      CONTEXT("moves %u, gains %u", at, k);
+      memset(&o, 0, sizeof o);
+      o.max_leaf = 1;
+      some_boxes(boxes, 8, 0);
+      g = geometry_of_boxes(boxes, 8, memory);
+      build_hierarchy(&b, &g, &o);
+      for (i = 0; i < 8; i++) {
+        boxes[i].first = i;
+        boxes[i] = trb_reference(boxes[i], b.costs);
+      }
+      for (i = 0; i < 4; i++) b.nodes[12 + i] = boxes[i];              /* below 8 and 10 */
+      b.nodes[5] = boxes[4]; b.nodes[7] = boxes[5]; b.nodes[9] = boxes[6]; b.nodes[11] = boxes[7];
+      b.nodes[8] = trb_parent(b.nodes[12], b.nodes[13], 12, b.costs);
+      b.nodes[10] = trb_parent(b.nodes[14], b.nodes[15], 14, b.costs);
+      b.nodes[4] = trb_parent(b.nodes[8], b.nodes[9], 8, b.costs);
+      b.nodes[6] = trb_parent(b.nodes[10], b.nodes[11], 10, b.costs);
+      b.nodes[2] = trb_parent(b.nodes[4], b.nodes[5], 4, b.costs);
+      b.nodes[3] = trb_parent(b.nodes[6], b.nodes[7], 6, b.costs);
+      b.nodes[0] = trb_parent(b.nodes[2], b.nodes[3], 2, b.costs);
+      m = start_moving(&b);
+      memset(m.owners, 0xFF, b.ref_count * sizeof *m.owners);
+      for (i = 0; i < 2; i++) {
+        m.moves[i].node = moves[at][2 * i];
+        m.moves[i].target = moves[at][2 * i + 1];
+        m.moves[i].above = 0;
+        m.moves[i].gain = gains[k][i];
+      }
+      trb_choose_moves(&m, 2);
+      CHECK_MSG(m.moves[winner].gain == gains[k][winner], "the better one gains %g", (double)m.moves[winner].gain);
+      CHECK_MSG(m.moves[!winner].gain == -gains[k][!winner], "the other one gains %g", (double)m.moves[!winner].gain);
+      CHECK(m.moves[!winner].node == moves[at][2 * !winner]);
+      trb_reinsert(&m, &m.moves[winner]);
+      trb_remake_moved(&m, 2);
+      memset(prims, 0, 8);
+      CHECK(check_moved(&b, 0, prims) == 8);
+      for (i = 0; i < 8; i++) CHECK(prims[i]);
+      for (i = 0; i < b.ref_count; i++) CHECK(m.owners[i] == TRBVH_NONE);
+      end_build(&b);
+    }
+}
+
 int main(int argc, char **argv) {
   test_start(argc, argv);
   RUN(test_numbers);
@@ -1363,5 +1597,8 @@ int main(int argc, char **argv) {
   RUN(test_fragments);
   RUN(test_median_plane);
   RUN(test_split_budget);
+  RUN(test_places);
+  RUN(test_moved_trees);
+  RUN(test_conflicts);
   return test_finish();
 }
