@@ -40,7 +40,7 @@ typedef struct measurement {           /* of one preset; times and rates below 0
   uint32_t triangles;
   int      preset;
   outcome  tree, trace;
-  double   ms, scalar_ms, bytes, target, mrays[2], scalar_mrays[2], other[2];
+  double   ms, moves_ms, scalar_ms, bytes, target, mrays[2], scalar_mrays[2], other[2];
   profile  profile;
 } measurement;
 
@@ -128,7 +128,7 @@ static void collect(profile *p, double wall_ms)
  * for each primitive, reference, leaf of the result (which has as many inner nodes, less one) and treelet root; and how
  * many times the mesh. Every array counts once, in sectors of 32 bytes where a kernel reads a field of a node; what
  * neighbours read again is for the caches. Kernels that hardly move anything, or only where there are gaps between
- * references, are not in it, so that no count is above what really moves. */
+ * references, or as far as searches lead them, are not in it, so that no count is above what really moves. */
 typedef struct traffic { const char *kernel; double prim, ref, leaf, root, mesh; int each; } traffic;
 static const traffic traffics[] = {
   /*                     prim  ref leaf root mesh each */
@@ -317,8 +317,8 @@ static int build_scalar(measurement *m, const ex_mesh *mesh, trbvh *tree)     /*
   }
   return 1;
 }
-/* Warm-ups, timed builds, profiled ones. Only the first has stats, which say what goes wrong: with them, a build waits
- * between its stages. */
+/* Warm-ups, timed builds, profiled ones. Only warm-ups have stats, which say what goes wrong, and how long moves take:
+ * with them, a build waits between its stages. */
 static outcome build_on_device(measurement *m, const ex_mesh *mesh, const trbvh_cl_geometry *g, trbvh_cl_tree *tree)
 {
   double times[RUNS];
@@ -327,7 +327,7 @@ static outcome build_on_device(measurement *m, const ex_mesh *mesh, const trbvh_
   trbvh_stats stats = {0};
   int run;
   for (run = -WARM_UPS; run < RUNS + PROFILES && !result; ++run) {
-    const trbvh_options o = options_of(m->preset, run == -WARM_UPS ? &stats : NULL);
+    const trbvh_options o = options_of(m->preset, run < 0 ? &stats : NULL);
     const int profiled = run >= RUNS && event_info && release_event;
     double ms = trb_ms();
     cl->queue = profiled ? profiling_queue : plain_queue;
@@ -344,6 +344,7 @@ static outcome build_on_device(measurement *m, const ex_mesh *mesh, const trbvh_
   cl->on_launch = NULL;
   if (result) return device_failed(m, "", result, stats.message[0] ? stats.message : cl->message);
   m->ms = median(times);
+  m->moves_ms = stats.ms_moves;
   m->bytes = count_bytes(&m->profile, mesh, tree, m->preset == 0 ? 0 : 3);
   return RIGHT;
 }
@@ -412,7 +413,7 @@ static int run_mesh(measurement *m, const char *path, uint32_t count, int has_ta
   for (preset = 0; preset < PRESETS; ++preset, ++m) {
     /* the mesh; scratch memory of 152 bytes and some 80 of a result for each reference */
     const double wanted = 12.0 * mesh.position_count + (12 + (preset == 2 ? 1.3 : 1) * (152 + 80)) * mesh.triangle_count;
-    m->ms = m->scalar_ms = m->profile.ms = -1;
+    m->ms = m->moves_ms = m->scalar_ms = m->profile.ms = -1;
     m->mrays[0] = m->mrays[1] = m->scalar_mrays[0] = m->scalar_mrays[1] = m->other[0] = m->other[1] = -1;
     snprintf(m->scene, sizeof m->scene, "%.20s", name);
     m->triangles = mesh.triangle_count;
@@ -450,13 +451,13 @@ static double gb_per_s(const measurement *m) { return divide(1e-6 * m->bytes, m-
 
 static void print_builds(const measurement *m, int count)
 {
-  printf("\n%-20s %10s  %-6s %10s %10s %8s %7s %10s %7s  %-10s %s\n", "builds", "triangles", "preset", "device ms", "kernels ms",
-      "Mtri/s", "GB/s", "C ms", "faster", "target ms", "identity");
+  printf("\n%-20s %10s  %-6s %10s %9s %10s %8s %7s %10s %7s  %-10s %s\n", "builds", "triangles", "preset", "device ms",
+      "moves ms", "kernels ms", "Mtri/s", "GB/s", "C ms", "faster", "target ms", "identity");
   for (; count--; ++m) {
     char target[24] = "";
     if (m->target > 0) snprintf(target, sizeof target, "%.0f %s", m->target, m->ms <= 0 ? "" : m->ms <= m->target ? "met" : "missed");
-    printf("%-20s %10u  %-6s %10s %10s %8s %7s %10s %7s  %-10s %s\n", m->scene, m->triangles, presets[m->preset], number(m->ms, 2),
-        number(m->profile.ms, 2), number(divide(1e-3 * m->triangles, m->ms), 1), rate(gb_per_s(m)), number(m->scalar_ms, 1),
+    printf("%-20s %10u  %-6s %10s %9s %10s %8s %7s %10s %7s  %-10s %s\n", m->scene, m->triangles, presets[m->preset],
+        number(m->ms, 2), number(m->moves_ms, 2), number(m->profile.ms, 2), number(divide(1e-3 * m->triangles, m->ms), 1), rate(gb_per_s(m)), number(m->scalar_ms, 1),
         number(divide(m->scalar_ms, m->ms), 1), target, words[m->tree]);
     if (m->note[0]) printf("    %.110s\n", m->note);
   }
@@ -511,7 +512,7 @@ static int write_csv(const char *path, const measurement *m, int count)         
   if (ftell(file) == 0) fprintf(file, "device,driver,kernels,scene,triangles,preset,what,launches,value,bytes\n");
   for (; count--; ++m) {
     const struct { const char *what; double value; } values[] = {
-      {"scalar_ms", m->scalar_ms}, {"identical", m->tree == LEFT_OUT ? -1 : m->tree == RIGHT},
+      {"moves_ms", m->moves_ms}, {"scalar_ms", m->scalar_ms}, {"identical", m->tree == LEFT_OUT ? -1 : m->tree == RIGHT},
       {"primary_mrays_per_s", m->mrays[0]}, {"scalar_primary_mrays_per_s", m->scalar_mrays[0]}, {"primary_other_prim", m->other[0]},
       {"diffuse_mrays_per_s", m->mrays[1]}, {"scalar_diffuse_mrays_per_s", m->scalar_mrays[1]}, {"diffuse_other_prim", m->other[1]}
     };

@@ -85,7 +85,7 @@ static void check_stats(const trbvh_stats *want, const trbvh_stats *got)
   CHECK_MSG(fabs(got->sah_cost - want->sah_cost) <= 1e-4 * fabs(want->sah_cost), "SAH %.9g; scalar: %.9g", got->sah_cost,
       want->sah_cost);
   CHECK(got->ms_total >= 0 && got->ms_split >= 0 && got->ms_morton >= 0 && got->ms_sort >= 0 && got->ms_hierarchy >= 0
-      && got->ms_treelets >= 0 && got->ms_collapse >= 0 && got->ms_finish >= 0 && got->ms_transfer >= 0);
+      && got->ms_moves >= 0 && got->ms_treelets >= 0 && got->ms_collapse >= 0 && got->ms_finish >= 0 && got->ms_transfer >= 0);
 }
 
 /* The same build in scalar C and on the device, there over what is in tree: nothing but the time may differ. */
@@ -164,12 +164,23 @@ static void test_every_size(void)
   if (!QUICK_OR(1, 0)) check_presets(make_mesh("terrain", 300000));
 }
 
-static const struct { int preset; float budget; int32_t rounds; uint32_t max_leaf; float node, prim; } variants[] = {
-  {2, 1, 0, 0, 0, 0},  {2, 16, 0, 0, 0, 0},   {2, 0.001f, 0, 0, 0, 0}, {2, -1, 0, 0, 0, 0},  {0, 0.3f, 0, 0, 0, 0},
-  {1, 0, 1, 0, 0, 0},  {1, 0, 5, 0, 0, 0},    {1, 0, 30, 0, 0, 0},     {1, 0, -1, 0, 0, 0},  {2, 0.5f, 2, 0, 0, 0},
-  {0, 0, 0, 1, 0, 0},  {1, 0, 0, 1, 0, 0},    {2, 0, 0, 1, 0, 0},      {1, 0, 0, 2, 0, 0},   {1, 0, 0, 4, 0, 0},
-  {2, 0, 0, 16, 0, 0}, {1, 0, 0, 1000, 0, 0}, {1, 0, 0, 0, 0.1f, 0},   {1, 0, 0, 0, 10, 0},  {1, 0, 0, 0, 0, 7.5f},
-  {1, 0, 0, 0, -1, 0}, {1, 0, 0, 0, 0, -1},   {1, 0, 0, 0, -1, -1},    {2, 0, 0, 16, 100, 0.001f}, {0, 0, 3, 3, 1e30f, 1e-30f}
+static const struct {
+  int preset; float budget; int32_t rounds; uint32_t max_leaf; float node, prim, share; int32_t unsplit, gamma;
+} variants[] = {
+  {2, 1, 0, 0, 0, 0, 0, 0, 0}, {2, 16, 0, 0, 0, 0, 0, 0, 0}, {2, 0.001f, 0, 0, 0, 0, 0, 0, 0},
+  {2, -1, 0, 0, 0, 0, 0, 0, 0}, {0, 0.3f, 0, 0, 0, 0, 0, 0, 0}, {1, 0, 1, 0, 0, 0, 0, 0, 0},
+  {1, 0, 5, 0, 0, 0, 0, 0, 0}, {1, 0, 30, 0, 0, 0, 0, 0, 0}, {1, 0, -1, 0, 0, 0, 0, 0, 0},
+  {2, 0.5f, 2, 0, 0, 0, 0, 0, 0}, {0, 0, 0, 1, 0, 0, 0, 0, 0}, {1, 0, 0, 1, 0, 0, 0, 0, 0},
+  {2, 0, 0, 1, 0, 0, 0, 0, 0}, {1, 0, 0, 2, 0, 0, 0, 0, 0}, {1, 0, 0, 4, 0, 0, 0, 0, 0},
+  {2, 0, 0, 16, 0, 0, 0, 0, 0}, {1, 0, 0, 1000, 0, 0, 0, 0, 0}, {1, 0, 0, 0, 0.1f, 0, 0, 0, 0},
+  {1, 0, 0, 0, 10, 0, 0, 0, 0}, {1, 0, 0, 0, 0, 7.5f, 0, 0, 0}, {1, 0, 0, 0, -1, 0, 0, 0, 0},
+  {1, 0, 0, 0, 0, -1, 0, 0, 0}, {1, 0, 0, 0, -1, -1, 0, 0, 0}, {2, 0, 0, 16, 100, 0.001f, 0, 0, 0},
+  {0, 0, 3, 3, 1e30f, 1e-30f, 0, 0, 0}, {0, 0.3f, 0, 0, 0, 0, 0, 2, 0}, {1, 0, 0, 0, 0, 0, -1, 0, 0},
+  {1, 0, 0, 0, 0, 0, 0.25f, 0, 0}, {1, 0, 5, 0, 0, 0, 0.25f, 0, 14}, {1, 0, 3, 0, 0, 0, -1, 0, 14},
+  {2, 0, 0, 0, 0, 0, -1, 0, 0}, {2, 0, 0, 0, 0, 0, 0, -1, 0}, {2, 0, 0, 0, 0, 0, 0, 1, 0},
+  {2, 16, 5, 0, 0, 0, 0.25f, 1, 14}, {2, 1, 1, 0, 0, 0, 0.25f, 0, 0}, {2, 1, -1, 0, 0, 0, 0.1f, 5, 0},
+  {2, 0, 0, 0, 0, 0, -1, -1, 0}, {2, 1, 0, 16, 100, 0.001f, 0.25f, 3, 0}, {2, 1, 30, 1, 0.1f, 0, 0.01f, 0, 1000},
+  {0, 0, 2, 0, 0, 0, 0.1f, 0, 0}, {3, 0, 0, 0, 0, 0, 0, 0, 0}
 };
 static void test_options(void)
 {
@@ -184,9 +195,13 @@ static void test_options(void)
       o.max_leaf = variants[v].max_leaf;
       o.cost_node = variants[v].node;
       o.cost_prim = variants[v].prim;
+      o.reinsert_share = variants[v].share;
+      o.unsplit_passes = variants[v].unsplit;
+      o.treelet_gamma = variants[v].gamma;
       o.flags = v & 1 ? TRBVH_NO_TRIANGLES : 0;
-      CONTEXT("scene %s, %s, budget %g, rounds %d, max_leaf %u, costs %g %g", m.s.name, preset_names[variants[v].preset],
-          (double)o.split_budget, (int)o.treelet_rounds, o.max_leaf, (double)o.cost_node, (double)o.cost_prim);
+      CONTEXT("scene %s, %s, budget %g, rounds %d from %d, max_leaf %u, costs %g %g, reinserted %g, unsplit %d", m.s.name,
+          preset_names[variants[v].preset], (double)o.split_budget, (int)o.treelet_rounds, (int)o.treelet_gamma, o.max_leaf,
+          (double)o.cost_node, (double)o.cost_prim, (double)o.reinsert_share, (int)o.unsplit_passes);
       check_same(&m.g, o);
     }
     mesh_free(&m);
