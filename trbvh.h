@@ -1083,11 +1083,12 @@ TRB_SHARED trb_grid trb_make_grid(trbvh_node bounds) {
 
 TRB_CORE trb_u64 trb_scale(trbvh_u32 i) { return (trb_u64)(64 + (i & 63)) << (i >> 6) >> 6; }
 
-/* The power of two that takes the largest priority to 24 bits. */
-TRB_CORE float trb_priority_unit(float largest) {
+/* The power of two that takes the largest of some values to so many bits. */
+TRB_CORE float trb_unit(float largest, trbvh_u32 bits) {
   trbvh_u32 exponent = trb_bits(largest) >> 23;
-  return trb_float((127u + 127u + 23u - TRB_MAX(exponent, 24u)) << 23);
+  return trb_float((127u + 127u + bits - 1 - TRB_MAX(exponent, bits)) << 23);
 }
+TRB_CORE float trb_priority_unit(float largest) { return trb_unit(largest, 24); }
 
 TRB_CORE trb_u64 trb_splits(float priority, float unit, trb_u64 scale) {
   return ((trb_u64)(trbvh_u32)(priority * unit) * scale) >> TRB_SCALE_BITS;
@@ -2144,6 +2145,33 @@ TRB_CORE void trb_merge_refs(const trb_mover *m, TRB_GLOBAL trb_move *move) {
   move->above = parent;
 }
 
+// ---- Do splits pay at all? ----
+/* Where nearly all that they save is tests of triangles, they cost time: nodes are more, and further apart in memory. So
+ * a tree with splits is kept only where it is better by TRB_SPLITS_PAY than the one without, both before their last
+ * round, in equation 1's sum with triangles that count half. Its terms are rounded to integers, so that their order does
+ * not matter. */
+#define TRB_SPLITS_PAY 0.98
+
+/* The power of two that takes the largest term, a root that may be a leaf, to 31 bits. */
+TRB_CORE float trb_cost_unit(trbvh_node root, trb_costs costs) {
+  return trb_unit(trb_area(root) * TRB_MAX(1.0f, 0.5f * costs.ratio * TRB_MAX_LEAF), 31);
+}
+
+TRB_CORE trbvh_u32 trb_round_cost(float cost) { return (trbvh_u32)TRB_MIN(cost, 2147483520.0f); }   /* areas may be infinite, or NaN */
+
+/* The part of a pair's parent in it, and of the pair's leaves; none below a leaf. */
+TRB_CORE trb_u64 trb_pair_cost(const trb_mover *m, trbvh_u32 pair, float unit) {
+  const trbvh_node left = m->nodes[2 * pair], right = m->nodes[2 * pair + 1];
+  const trbvh_node parent = trb_parent(left, right, 0, m->costs);
+  const float half = 0.5f * m->costs.ratio * unit;
+  trb_u64 cost = 0;
+  if (trb_is_free(left) || trb_is_leaf(parent.count)) return 0;
+  cost += trb_round_cost(unit * trb_area(parent));
+  if (trb_is_leaf(left.count)) cost += trb_round_cost(half * trb_area(left) * (float)trb_count(left.count));
+  if (trb_is_leaf(right.count)) cost += trb_round_cost(half * trb_area(right) * (float)trb_count(right.count));
+  return cost;
+}
+
 // >>collapse ---- subtrees that are cheaper as leaves become leaves, and the tree moves into its final layout --------
 /* Every small node knows already whether it is better as a leaf (equation 2, trb_parent); the topmost such nodes
  * become leaves. The result has parents before children and right before left: a pair of siblings, all that is below
@@ -3050,21 +3078,25 @@ typedef struct trb_build {
   trb_costs             costs;
   trb_grid              grid;
   uint32_t              ref_max, ref_count, split_max;
+  int                   splitting;       /* is this attempt's tree one with splits? */
+  float                 effort;          /* of all that grows trees, this attempt */
   int                   final;           /* the hierarchy's topology is the result's */
   int                   guessed;         /* trb_read has made the keys */
   /* scratch memory; what stands on one line shares it, one after the other */
   void                 *scratch;
   size_t                scratch_size;
-  trbvh_node           *refs;            /* ref_max, where there are splits, else NULL */
+  trbvh_node           *split_refs;      /* ref_max, where there may be splits */
+  trbvh_node           *refs;            /* they, in an attempt with splits; else NULL */
   trb_u64              *keys, *sorted;   /* ref_max each */                      float *priorities;
   trbvh_node           *nodes;           /* 2 * ref_max + 2 */                   trbvh_node *unsplit;   /* like refs */
   trb_block            *blocks;
   trb_range            *ranges;          /* for each TRB_BLOCK of ref_max */     uint32_t *histograms;  /* the sort's, smaller */
+                                                                                 trb_u64 *sums;
   trb_group            *groups;
   trb_task             *tasks;
   uint32_t              block_count, task_count, group_count;
   double                sah;             /* equation 1's sum above the tasks */
-  struct { uint32_t gamma, rounds, last; } phase;    /* of treelets */
+  struct { uint32_t last, unsplits, gamma, rounds; } phase;
   uint32_t              slot_count;      /* of refs, gaps among them */
   uint32_t              lowest_score, move_count, batch;
   float                 moves_share;     /* of the call's time: one batch of moves */
@@ -3185,10 +3217,9 @@ static trbvh_result trb_resolve_size(trb_build *b) {
     return trb_fail(b, TRBVH_TOO_LARGE, "%u primitives make more references than fit", b->input.count, 0, 0);
   b->split_max = (uint32_t)extra;
   b->ref_max = (uint32_t)refs;
-  b->key_form = trb_choose_keys(b->ref_max);
   /* Neither restructured, nor looked through for a primitive's second reference, nor too deep: packed keys differ in
    * fewer bits than TRBVH_MAX_DEPTH. */
-  b->final = b->options.treelet_rounds == 0 && b->split_max == 0 && b->key_form.packed;
+  b->final = b->options.treelet_rounds == 0 && b->split_max == 0 && trb_choose_keys(b->ref_max).packed;
   return TRBVH_OK;
 }
 
@@ -3210,7 +3241,7 @@ static size_t trb_lay_out(trb_build *b, char *base) {
   #define TRB_PART(member, type, bytes) \
     b->member = base ? (type *)(void *)(base + size) : NULL; \
     size = (size + (bytes) + TRB_LINE - 1) & ~(size_t)(TRB_LINE - 1);
-  TRB_PART(refs,       trbvh_node, b->split_max ? n * TRB_NODE_BYTES : 0)
+  TRB_PART(split_refs, trbvh_node, b->split_max ? n * TRB_NODE_BYTES : 0)
   TRB_PART(keys,       trb_u64,    n * 8)
   TRB_PART(sorted,     trb_u64,    n * 8)
   TRB_PART(nodes,      trbvh_node, (n * 2 + 2) * TRB_NODE_BYTES)
@@ -3222,8 +3253,15 @@ static size_t trb_lay_out(trb_build *b, char *base) {
   b->priorities = (float *)(void *)b->keys;
   b->unsplit = b->nodes;
   b->histograms = (uint32_t *)(void *)b->ranges;
-  if (!b->split_max) b->refs = b->unsplit = NULL;
+  b->sums = (trb_u64 *)(void *)b->ranges;
   return size + TRB_LINE;
+}
+
+static void trb_start_attempt(trb_build *b, int splitting) {
+  b->splitting = splitting;
+  b->refs = splitting ? b->split_refs : NULL;
+  b->key_form = trb_choose_keys(splitting ? b->ref_max : b->input.count);
+  b->ref_count = b->stats.skipped_count = 0;
 }
 
 static size_t trb_result_size(const trb_build *b, size_t leaves, size_t prims) {
@@ -3318,7 +3356,7 @@ static void trb_read_job(void *context, uint32_t index) {
       trb_row_keys(&row, first, b->grid, b->key_form, key);
       memcpy(b->keys + first, key, n * sizeof *key);
     }
-    for (i = 0; b->unsplit && i < good; i++) {
+    for (i = 0; b->splitting && i < good; i++) {
       b->unsplit[first + i] = trb_row_box(&row, i);
       if (!row.valid[i]) b->unsplit[first + i].first = TRBVH_NONE;
     }
@@ -3353,7 +3391,7 @@ static trbvh_result trb_read(trb_build *b) {
   uint32_t i;
   int k, equal = 1;
   b->block_count = trb_blocks(b->input.count, TRB_READ_BLOCK);
-  b->guessed = b->input.indices && b->input.position_count <= b->input.count && !b->split_max;
+  b->guessed = b->input.indices && b->input.position_count <= b->input.count && !b->splitting;
   if (b->guessed) {
     if (trb_run(&b->runner, b->block_count, trb_guess_job, b)) return TRBVH_CANCELLED;
     guess = trb_sum_bounds(b);
@@ -3756,15 +3794,14 @@ static void trb_search_merges_job(void *context, uint32_t index) {
   for (; i < end; i++) trb_search_merge(&m, i * TRB_MOVE_BATCHES + b->batch, b->slot_count);
 }
 
-static int trb_unsplit(trb_build *b) {
+static int trb_unsplit(trb_build *b, uint32_t passes) {
   const trb_mover m = trb_build_mover(b);
-  int32_t pass;
-  uint32_t i;
+  uint32_t pass, i;
   if (!b->refs || trb_run_moves(b, trb_blocks(b->slot_count, TRB_BLOCK), trb_forget_refs_job) ||
       trb_run_moves(b, trb_pair_blocks(b), trb_find_refs_job)) return b->runner.cancelled;
   memset(m.owners, 0xFF, (size_t)b->ref_count * sizeof *m.owners);
   b->move_count = TRB_MOVES_MAX(b->slot_count);
-  for (pass = 0; pass < b->options.unsplit_passes; pass++)
+  for (pass = 0; pass < passes; pass++)
     for (b->batch = 0; b->batch < TRB_MOVE_BATCHES; b->batch++) {
       if (trb_run_moves(b, trb_blocks(b->move_count, TRB_SEARCHES), trb_search_merges_job)) return 1;
       trb_choose_moves(&m, b->move_count);
@@ -3772,6 +3809,24 @@ static int trb_unsplit(trb_build *b) {
         if (m.moves[i].gain > 0) trb_merge_refs(&m, &m.moves[i]);
       trb_remake_moved(&m, b->move_count);
     }
+  return 0;
+}
+
+static void trb_cost_job(void *context, uint32_t index) {
+  const trb_build *b = (const trb_build *)context;
+  const trb_mover m = trb_build_mover(b);
+  const float unit = trb_cost_unit(b->nodes[0], b->costs);
+  uint32_t pair = TRB_MAX(1, index * TRB_BLOCK), end = TRB_MIN(b->ref_count, (index + 1) * TRB_BLOCK);
+  b->sums[index] = 0;
+  for (; pair < end; pair++) b->sums[index] += trb_pair_cost(&m, pair, unit);
+}
+
+static int trb_sum_costs(trb_build *b, double *cost) {
+  trb_u64 sum = 0;
+  uint32_t i;
+  if (trb_run(&b->runner, trb_pair_blocks(b), trb_cost_job, b)) return 1;
+  for (i = 0; i < trb_pair_blocks(b); i++) sum += b->sums[i];
+  *cost = (double)sum;
   return 0;
 }
 
@@ -3937,41 +3992,77 @@ static uint32_t trb_phases(const trb_build *b) {
 
 static void trb_start_phase(trb_build *b, uint32_t phase) {
   const uint32_t phases = trb_phases(b), gamma = (uint32_t)b->options.treelet_gamma;
+  const uint32_t passes = b->splitting ? (uint32_t)b->options.unsplit_passes : 0;
   const uint32_t shift = TRB_MIN(2 * (phases - 1 - phase), 31u);
   b->phase.last = phase + 1 == phases;
   b->phase.rounds = phases > 1 ? 1 : (uint32_t)b->options.treelet_rounds;
   b->phase.gamma = gamma > TRB_REFS_MAX >> shift ? TRB_REFS_MAX : gamma << shift;
+  b->phase.unsplits = passes > phase + 1 ? passes - phase : TRB_MIN(passes, 1);
 }
 
-static trbvh_result trb_run_phases(trb_build *b, float share, float settling) {
-  const uint32_t phases = trb_phases(b);
-  const uint32_t unsplits = b->split_max ? (uint32_t)b->options.unsplit_passes : 0;
-  const float part = share / (float)phases;
+/* Does one more tree say whether splits are kept? Not where all are to be, as in the paper. */
+static int trb_compares(const trb_build *b) {
+  return b->split_max && b->options.unsplit_passes && trb_phases(b) > 1;
+}
+
+/* Makes a tree from the mesh, up to its last phase; tells what it costs, if that is not NULL. */
+typedef trbvh_result trb_attempt(void *worker, int splitting, double *cost);
+
+/* The one without splits is made again where it turns out to be the better one: that takes less memory, and no longer on
+ * the whole, than making it last. */
+static trbvh_result trb_attempt_both(trb_build *b, trb_attempt *attempt, void *worker) {
+  double without, with;
+  trbvh_result result;
+  b->effort = 1;
+  if (!trb_compares(b)) return attempt(worker, b->split_max > 0, NULL);
+  b->effort = 1 / 3.0f;
+  result = attempt(worker, 0, &without);
+  if (!result) result = attempt(worker, 1, &with);
+  return !result && with > TRB_SPLITS_PAY * without ? attempt(worker, 0, NULL) : result;
+}
+
+static trbvh_result trb_run_phase(trb_build *b, uint32_t phase) {
+  const float share = 0.65f / (float)trb_phases(b), part = b->phase.last ? share : share * b->effort;
+  trbvh_result result = TRBVH_OK;
+  trb_start_phase(b, phase);
+  b->moves_share = part * 0.25f / (float)((b->phase.unsplits + 1) * TRB_MOVE_BATCHES + 6);
+  if (b->phase.unsplits) { TRB_STAGE(0, ms_moves, trb_unsplit(b, b->phase.unsplits) ? TRBVH_CANCELLED : TRBVH_OK) }
+  if (b->phase.unsplits || phase) { TRB_STAGE(0, ms_moves, trb_reinsert_candidates(b) ? TRBVH_CANCELLED : TRBVH_OK) }
+  if (b->phase.rounds) { TRB_STAGE(phase ? part * 0.75f : part, ms_treelets, trb_restructure_and_settle(b)) }
+  else { TRB_STAGE(0, ms_collapse, trb_restructure_and_settle(b)) }
+  return result;
+}
+
+/* What comes before and after treelets, in parts of the time. */
+static float trb_other_share(const trb_build *b) {
+  return 1 - (b->options.treelet_rounds ? 0.65f : 0) - (b->split_max ? 0.15f : 0);
+}
+
+static trbvh_result trb_attempt_in_c(void *worker, int splitting, double *cost) {
+  trb_build *b = (trb_build *)worker;
+  const float rest = trb_other_share(b) * b->effort;
   trbvh_result result = TRBVH_OK;
   uint32_t phase;
-  for (phase = 0; phase < phases; phase++) {
-    trb_start_phase(b, phase);
-    b->moves_share = part * 0.25f / (float)((unsplits + 1) * TRB_MOVE_BATCHES + 6);
-    if (unsplits) { TRB_STAGE(0, ms_moves, trb_unsplit(b) ? TRBVH_CANCELLED : TRBVH_OK) }
-    if (unsplits || phase) { TRB_STAGE(0, ms_moves, trb_reinsert_candidates(b) ? TRBVH_CANCELLED : TRBVH_OK) }
-    if (b->phase.rounds) { TRB_STAGE(phase ? part * 0.75f : part, ms_treelets, trb_restructure_and_settle(b)) }
-    else { TRB_STAGE(settling, ms_collapse, trb_restructure_and_settle(b)) }
-  }
+  trb_start_attempt(b, splitting);
+  TRB_STAGE(rest * 0.15f, ms_morton, trb_read(b))
+  if (splitting) { TRB_STAGE(0.15f, ms_split, trb_split(b)) }
+  if (cost) *cost = 0;
+  if (result || b->ref_count == 0) return result;
+  TRB_STAGE(rest * 0.05f, ms_morton, trb_make_keys(b) ? TRBVH_CANCELLED : TRBVH_OK)
+  TRB_STAGE(rest * 0.20f, ms_sort, trb_sort_keys(b))
+  TRB_STAGE(rest * 0.25f, ms_hierarchy, trb_build_hierarchy(b))
+  for (phase = 0; !result && phase + 1 < trb_phases(b); phase++) result = trb_run_phase(b, phase);
+  if (cost) { TRB_STAGE(0, ms_split, trb_sum_costs(b, cost) ? TRBVH_CANCELLED : TRBVH_OK) }
   return result;
 }
 
 static trbvh_result trb_run_stages(trb_build *b, trbvh *bvh) {
-  const float treelets = b->options.treelet_rounds ? 0.65f : 0, split = b->split_max ? 0.15f : 0;
-  const float rest = 1 - treelets - split;
+  const float rest = trb_other_share(b);
   trbvh_result result = trb_allocate_scratch(b);
-  TRB_STAGE(rest * 0.15f, ms_morton, trb_read(b))
-  if (b->split_max) { TRB_STAGE(split, ms_split, trb_split(b)) }
-  if (!result && b->ref_count == 0) return TRBVH_OK;
-  TRB_STAGE(rest * 0.05f, ms_morton, trb_make_keys(b) ? TRBVH_CANCELLED : TRBVH_OK)
-  TRB_STAGE(rest * 0.20f, ms_sort, trb_sort_keys(b))
-  TRB_STAGE(rest * 0.25f, ms_hierarchy, trb_build_hierarchy(b))
-  if (!result) result = trb_run_phases(b, treelets, rest * 0.10f);
-  TRB_STAGE(rest * 0.10f, ms_collapse, trb_emit(b, bvh))
+  if (!result) result = trb_attempt_both(b, trb_attempt_in_c, b);
+  if (result || b->ref_count == 0) return result;
+  result = trb_run_phase(b, trb_phases(b) - 1);
+  TRB_STAGE(rest * 0.20f, ms_collapse, trb_emit(b, bvh))
   trb_free_scratch(b);                               /* before the triangles are touched: less memory at a time */
   TRB_STAGE(rest * 0.15f, ms_finish, trb_finish(b))
   if (!result && trb_stage(&b->runner, 0)) result = TRBVH_CANCELLED;

@@ -367,6 +367,7 @@ static void begin_build(trb_build *b, const trbvh_geometry *g, const trbvh_optio
   CHECK(trb_resolve(b, g, o) == TRBVH_OK);
   trb_runner_start(&b->runner, &b->options, 0);
   CHECK(trb_allocate_scratch(b) == TRBVH_OK);
+  trb_start_attempt(b, b->split_max > 0);
 }
 static void end_build(trb_build *b) {
   trb_runner_stop(&b->runner);
@@ -711,6 +712,7 @@ static void test_leaf_order(void) {
           CHECK_MSG(walk_tree(&bvh, &g, 1, preset >= 2, &info, why, sizeof why), "%s", why);
           if (preset == 0 && bvh.nodes) {
             CHECK(trb_resolve(&b, &g, &o) == TRBVH_OK);
+            trb_start_attempt(&b, 0);
             b.grid = trb_make_grid(bvh.nodes[0]);
             for (i = 0; i < count; i++) {
               float v[3][3];
@@ -1202,7 +1204,7 @@ static void test_depth_bound(void) {
             b.nodes[2 * i + 1 - left] = rest;
           }
           b.nodes[0] = trb_parent(b.nodes[2], b.nodes[3], 2, b.costs);
-          CHECK(trb_run_phases(&b, 1, 0) == TRBVH_OK);
+          for (i = 0; i < trb_phases(&b); i++) CHECK(trb_run_phase(&b, i) == TRBVH_OK);
           CHECK(trb_emit(&b, &bvh) == TRBVH_OK && trb_finish(&b) == TRBVH_OK);
           trb_hand_over(&b, &bvh, n);
           CHECK_MSG(trbvh_validate(&bvh, &g, why, sizeof why) == TRBVH_OK, "%s", why);
@@ -1501,7 +1503,7 @@ static void test_moved_trees(void) {
     build_hierarchy(&b, &g, &o);
     b.runner.options = &b.options;
     before = area_after(b.nodes, 0, TRBVH_NONE, TRBVH_NONE, &box);
-    CHECK(!trb_unsplit(&b));
+    CHECK(!trb_unsplit(&b, 2));
     for (i = 0, passed = 0; b.refs && i < b.slot_count; i++)
       passed += b.refs[i].first != TRBVH_NONE && b.refs[i].count == TRBVH_NONE;
     if (b.refs) CHECK_MSG(passed > 0, "all splits pay");

@@ -224,6 +224,7 @@ static inline trbvh_result paper_make(trbvh *bvh, const trbvh_geometry *geometry
   b->final = 0;
   trb_runner_start(&b->runner, &b->options, 1);
   if (!result && b->input.count) result = trb_allocate_scratch(b);
+  trb_start_attempt(b, b->split_max > 0);
   if (!result && b->input.count) result = trb_read(b);
   if (!result && b->ref_count) {
     p.ref_max = b->ref_max;
