@@ -217,7 +217,9 @@ typedef struct trbvh_options {
                                             at most 0.25. Rounds then go from large subtrees to small ones: those of
                                             gamma * 4^(rounds - 1 - r) references or more in round r; none (negative):
                                             gamma * 2^r, which is the paper's */
-  int32_t         unsplit_passes;        /* over all splits before each round, to take back those that do not pay; at most 16 */
+  int32_t         unsplit_passes;        /* over all splits before the first round, to take back those that do not pay, and
+                                            one fewer each time before the next rounds, but one at least; at most 16.
+                                            With reinsertion there are no splits at all where they hardly pay altogether */
 } trbvh_options;
 struct trbvh_stats {
   double   ms_total, ms_split, ms_morton, ms_sort, ms_hierarchy, ms_treelets, ms_collapse, ms_finish, ms_transfer;   /* with treelets, leaves are chosen in ms_treelets */
@@ -2160,15 +2162,15 @@ TRB_CORE float trb_cost_unit(trbvh_node root, trb_costs costs) {
 TRB_CORE trbvh_u32 trb_round_cost(float cost) { return (trbvh_u32)TRB_MIN(cost, 2147483520.0f); }   /* areas may be infinite, or NaN */
 
 /* The part of a pair's parent in it, and of the pair's leaves; none below a leaf. */
-TRB_CORE trb_u64 trb_pair_cost(const trb_mover *m, trbvh_u32 pair, float unit) {
-  const trbvh_node left = m->nodes[2 * pair], right = m->nodes[2 * pair + 1];
-  const trbvh_node parent = trb_parent(left, right, 0, m->costs);
-  const float half = 0.5f * m->costs.ratio * unit;
+TRB_CORE trb_u64 trb_pair_cost(const TRB_GLOBAL trbvh_node *nodes, trbvh_u32 pair, float unit, trb_costs costs) {
+  const trbvh_node left = nodes[2 * pair], right = nodes[2 * pair + 1];
+  const trbvh_node parent = trb_parent(left, right, 0, costs);
+  const float weight = 0.5f * costs.ratio * unit;
   trb_u64 cost = 0;
   if (trb_is_free(left) || trb_is_leaf(parent.count)) return 0;
   cost += trb_round_cost(unit * trb_area(parent));
-  if (trb_is_leaf(left.count)) cost += trb_round_cost(half * trb_area(left) * (float)trb_count(left.count));
-  if (trb_is_leaf(right.count)) cost += trb_round_cost(half * trb_area(right) * (float)trb_count(right.count));
+  if (trb_is_leaf(left.count)) cost += trb_round_cost(weight * trb_area(left) * (float)trb_count(left.count));
+  if (trb_is_leaf(right.count)) cost += trb_round_cost(weight * trb_area(right) * (float)trb_count(right.count));
   return cost;
 }
 
@@ -2753,6 +2755,7 @@ TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbv
 typedef struct trb_plan {
   trb_u64      position_offset, position_stride, index_offset;   /* bytes; boxes stand in positions' place */
   trb_u64      scale;                    /* of the splits; scale_low is its number, or a lower bound */
+  trb_u64      cost;                     /* what the tree costs, before its last phase */
   trb_costs    costs;
   trb_key_form form;
   float        cost_node, cost_prim;
@@ -3814,11 +3817,10 @@ static int trb_unsplit(trb_build *b, uint32_t passes) {
 
 static void trb_cost_job(void *context, uint32_t index) {
   const trb_build *b = (const trb_build *)context;
-  const trb_mover m = trb_build_mover(b);
   const float unit = trb_cost_unit(b->nodes[0], b->costs);
   uint32_t pair = TRB_MAX(1, index * TRB_BLOCK), end = TRB_MIN(b->ref_count, (index + 1) * TRB_BLOCK);
   b->sums[index] = 0;
-  for (; pair < end; pair++) b->sums[index] += trb_pair_cost(&m, pair, unit);
+  for (; pair < end; pair++) b->sums[index] += trb_pair_cost(b->nodes, pair, unit, b->costs);
 }
 
 static int trb_sum_costs(trb_build *b, double *cost) {

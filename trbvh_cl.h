@@ -88,8 +88,9 @@ typedef struct trbvh_cl_tree {
  * trbvh_cl_message and options->stats tell why.
  * Options: flags, quality and its settings, progress, stats. Whatever fails, there is no scalar build behind these.
  *
- * build waits once, for some 200 bytes of counts, to make the result's buffers in the right size; with options->stats or
- * options->progress after every stage; and on a CPU where its scratch memory grows. tree is {0}, or a tree of the same
+ * build waits once, for some 200 bytes of counts, to make the result's buffers in the right size; with HIGH and BEST twice
+ * more, to learn whether splits pay; with options->stats or options->progress after every stage; and on a CPU where its
+ * scratch memory grows. tree is {0}, or a tree of the same
  * device, whose buffers are freed.
  * refit: the mesh has moved, its topology has not. Boxes of a tree without splits become what build makes them; in one
  * with splits a leaf gets its whole triangles' boxes. The indices are not checked again. */
@@ -153,9 +154,9 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "typedef struct trbvh_hit { float t, u, v; trbvh_u32 prim; trbvh_u32 instance; } trbvh_hit;\n",
-  "#line 277 \"trbvh.h\"\n",
+  "#line 279 \"trbvh.h\"\n",
   "  #pragma OPENCL FP_CONTRACT OFF\n",
-  "#line 288 \"trbvh.h\"\n",
+  "#line 290 \"trbvh.h\"\n",
   "  #ifdef TRB_OUTLINE\n",
   "    #define TRB_CORE static inline __attribute__((unused))\n",
   "  #else\n",
@@ -174,11 +175,11 @@ static const char *const trb_cl_text[] = {
   "  #endif\n",
   "  #define trb_bits(x)  as_uint(x)\n",
   "  #define trb_float(x) as_float(x)\n",
-  "#line 328 \"trbvh.h\"\n",
+  "#line 330 \"trbvh.h\"\n",
   "#ifndef TRB_PREFETCH\n",
   "  #define TRB_PREFETCH(address) ((void)(address))\n",
   "#endif\n",
-  "#line 387 \"trbvh.h\"\n",
+  "#line 389 \"trbvh.h\"\n",
   "#ifndef TRBVH_ASSERT\n",
   "  #define TRBVH_ASSERT(x) ((void)0)\n",
   "#endif\n",
@@ -186,17 +187,17 @@ static const char *const trb_cl_text[] = {
   "\n",
   "    #define TRB_REAL float\n",
   "    #define TRB_NOISE 9.5367432e-7f\n",
-  "#line 398 \"trbvh.h\"\n",
+  "#line 400 \"trbvh.h\"\n",
   "#endif\n",
   "\n",
   "  #define TRB_ALIGNED(type) type __attribute__((aligned(64)))\n",
-  "#line 406 \"trbvh.h\"\n",
+  "#line 408 \"trbvh.h\"\n",
   "#if defined(__cplusplus) || defined(_MSC_VER)\n",
   "  #define TRB_RESTRICT __restrict\n",
   "#else\n",
   "  #define TRB_RESTRICT restrict\n",
   "#endif\n",
-  "#line 421 \"trbvh.h\"\n",
+  "#line 423 \"trbvh.h\"\n",
   "#define TRB_MIN(a, b) ((a) < (b) ? (a) : (b))\n",
   "#define TRB_MAX(a, b) ((a) > (b) ? (a) : (b))\n",
   "\n",
@@ -233,7 +234,7 @@ static const char *const trb_cl_text[] = {
   "  for (i = 0; i < 4; i++) r = r * (4.0f - x * r * r * r) * 0.333333343f;\n",
   "  return x * r * r;\n",
   "}\n",
-  "#line 467 \"trbvh.h\"\n",
+  "#line 469 \"trbvh.h\"\n",
   "#define TRB_MAX_LEAF 16u\n",
   "#define TRB_SMALL    0x80000000u\n",
   "#define TRB_LEAF     0x40000000u\n",
@@ -313,7 +314,7 @@ static const char *const trb_cl_text[] = {
   "  return trb_morton(0.5f * box.min[0] + 0.5f * box.max[0], 0.5f * box.min[1] + 0.5f * box.max[1],\n",
   "                    0.5f * box.min[2] + 0.5f * box.max[2], grid);\n",
   "}\n",
-  "#line 559 \"trbvh.h\"\n",
+  "#line 561 \"trbvh.h\"\n",
   "#define TRB_TREELET 7\n",
   "#define TRB_GPU_LANES 32u\n",
   "#if defined(TRB_GPU)\n",
@@ -360,7 +361,7 @@ static const char *const trb_cl_text[] = {
   "  1 << TRB_SKIP(1, without), 1 << TRB_SKIP(2, without), 1 << TRB_SKIP(3, without), 1 << TRB_SKIP(4, without), \\\n",
   "  1 << TRB_SKIP(5, without)))\n",
   "#define TRB_SKIP(i, without) ((i) + ((i) >= (without)))\n",
-  "#line 609 \"trbvh.h\"\n",
+  "#line 611 \"trbvh.h\"\n",
   "#define TRB_DEFINE_TREELET_COSTS(function) \\\n",
   "  function(const TRB_WORK float *TRB_RESTRICT leaves, TRB_WORK float *TRB_RESTRICT table, float *TRB_RESTRICT sums, \\\n",
   "           trb_costs costs) { \\\n",
@@ -436,7 +437,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "TRB_CORE int trb_improves(float cost, float old_cost) { return cost < old_cost - old_cost * 3.8147e-6f; }\n",
-  "#line 689 \"trbvh.h\"\n",
+  "#line 691 \"trbvh.h\"\n",
   "typedef struct trb_plane { int axis, level; float position; } trb_plane;\n",
   "#define TRB_TINY 1e-30f\n",
   "\n",
@@ -526,7 +527,7 @@ static const char *const trb_cl_text[] = {
   "    for (j = 0; j < 3; j++) polygon[i][j] = kept[i][j];\n",
   "  return count;\n",
   "}\n",
-  "#line 783 \"trbvh.h\"\n",
+  "#line 785 \"trbvh.h\"\n",
   "TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {\n",
   "  float polygon[TRB_POLYGON][3], pad[3];\n",
   "  trbvh_node bounds = *box;\n",
@@ -555,7 +556,7 @@ static const char *const trb_cl_text[] = {
   "  *box = bounds;\n",
   "  return 1;\n",
   "}\n",
-  "#line 815 \"trbvh.h\"\n",
+  "#line 817 \"trbvh.h\"\n",
   "  typedef struct trb_mesh {\n",
   "    const __global char *positions, *indices, *boxes;\n",
   "    ulong position_stride, box_stride;\n",
@@ -570,7 +571,7 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE float trb_load_float(const TRB_GLOBAL char *p) {\n",
   "\n",
   "  return *(const __global float *)p;\n",
-  "#line 837 \"trbvh.h\"\n",
+  "#line 839 \"trbvh.h\"\n",
   "}\n",
   "\n",
   "TRB_CORE void trb_load_position(float out[3], const TRB_GLOBAL char *p) {\n",
@@ -582,13 +583,13 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE trbvh_u32 trb_index16(const trb_mesh *mesh, size_t i) {\n",
   "\n",
   "  return ((const __global ushort *)mesh->indices)[i];\n",
-  "#line 853 \"trbvh.h\"\n",
+  "#line 855 \"trbvh.h\"\n",
   "}\n",
   "\n",
   "TRB_CORE trbvh_u32 trb_index32(const trb_mesh *mesh, size_t i) {\n",
   "\n",
   "  return ((const __global uint *)mesh->indices)[i];\n",
-  "#line 863 \"trbvh.h\"\n",
+  "#line 865 \"trbvh.h\"\n",
   "}\n",
   "\n",
   "TRB_CORE trbvh_u32 trb_index(const trb_mesh *mesh, size_t i) {\n",
@@ -800,7 +801,7 @@ static const char *const trb_cl_text[] = {
   "  grid.cells_per_unit = extent > 1e-30f && extent < FLT_MAX ? trb_reciprocal(grid.units_per_cell) : 0;\n",
   "  return grid;\n",
   "}\n",
-  "#line 1080 \"trbvh.h\"\n",
+  "#line 1082 \"trbvh.h\"\n",
   "#define TRB_SCALE_BITS  36\n",
   "#define TRB_SCALES      2561u\n",
   "#define TRB_SPLIT_STACK 64u\n",
@@ -808,10 +809,11 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE trb_u64 trb_scale(trbvh_u32 i) { return (trb_u64)(64 + (i & 63)) << (i >> 6) >> 6; }\n",
   "\n",
   "\n",
-  "TRB_CORE float trb_priority_unit(float largest) {\n",
+  "TRB_CORE float trb_unit(float largest, trbvh_u32 bits) {\n",
   "  trbvh_u32 exponent = trb_bits(largest) >> 23;\n",
-  "  return trb_float((127u + 127u + 23u - TRB_MAX(exponent, 24u)) << 23);\n",
+  "  return trb_float((127u + 127u + bits - 1 - TRB_MAX(exponent, bits)) << 23);\n",
   "}\n",
+  "TRB_CORE float trb_priority_unit(float largest) { return trb_unit(largest, 24); }\n",
   "\n",
   "TRB_CORE trb_u64 trb_splits(float priority, float unit, trb_u64 scale) {\n",
   "  return ((trb_u64)(trbvh_u32)(priority * unit) * scale) >> TRB_SCALE_BITS;\n",
@@ -857,7 +859,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "  return count;\n",
   "}\n",
-  "#line 1142 \"trbvh.h\"\n",
+  "#line 1145 \"trbvh.h\"\n",
   "#ifndef TRB_PACKED_REFS\n",
   "  #define TRB_PACKED_REFS (1u << 24)\n",
   "#endif\n",
@@ -917,7 +919,7 @@ static const char *const trb_cl_text[] = {
   "      start += n;\n",
   "    }\n",
   "}\n",
-  "#line 1209 \"trbvh.h\"\n",
+  "#line 1212 \"trbvh.h\"\n",
   "#define TRB_BLOCK    16384u\n",
   "#define TRB_TOP      1024u\n",
   "#define TRB_NEAR     98304u\n",
@@ -939,7 +941,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "TRB_CORE trbvh_node trb_curve_ref(const trb_curve *c, trb_u64 key) {\n",
   "  const trbvh_u32 ref = trb_key_ref(key, c->form);\n",
-  "#line 1240 \"trbvh.h\"\n",
+  "#line 1243 \"trbvh.h\"\n",
   "  return c->refs[ref];\n",
   "}\n",
   "\n",
@@ -947,7 +949,7 @@ static const char *const trb_cl_text[] = {
   "TRB_SHARED void trb_read_leaves(const trb_curve *c, trbvh_u32 first, trbvh_u32 count, trbvh_u32 end, trb_row *row) {\n",
   "  const trbvh_u32 next = first + count, soon = TRB_MIN(next + TRB_ROW, end);\n",
   "  trbvh_u32 i, k;\n",
-  "#line 1257 \"trbvh.h\"\n",
+  "#line 1260 \"trbvh.h\"\n",
   "  for (i = next; i < soon; i++) TRB_PREFETCH(&c->refs[trb_key_ref(c->keys[i], c->form)]);\n",
   "  for (i = 0; i < count; i++) {\n",
   "    const trbvh_node ref = c->refs[trb_key_ref(c->keys[first + i], c->form)];\n",
@@ -966,7 +968,7 @@ static const char *const trb_cl_text[] = {
   "  code = trb_box_code(trb_curve_ref(c, a), c->grid) ^ trb_box_code(trb_curve_ref(c, b), c->grid);\n",
   "  return code ? code | (trb_u64)1 << 63 : (trbvh_u32)(a ^ b);\n",
   "}\n",
-  "#line 1279 \"trbvh.h\"\n",
+  "#line 1282 \"trbvh.h\"\n",
   "typedef struct trb_open {\n",
   "  trbvh_node node;\n",
   "  trb_u64    split;\n",
@@ -983,7 +985,7 @@ static const char *const trb_cl_text[] = {
   "  trbvh_u32  end, pairs;\n",
   "  struct { trb_u64 split; trbvh_u32 pair, prim, first_pair; } stack[TRB_OPEN_MAX];\n",
   "} trb_forest;\n",
-  "#line 1299 \"trbvh.h\"\n",
+  "#line 1302 \"trbvh.h\"\n",
   "#define TRB_TO_RESTRUCTURE 0\n",
   "#define TRB_FINAL_BLOCK    1\n",
   "#define TRB_FINAL_TOP      2\n",
@@ -1087,7 +1089,7 @@ static const char *const trb_cl_text[] = {
   "    }\n",
   "  TRBVH_ASSERT(f.height == 1);\n",
   "}\n",
-  "#line 1406 \"trbvh.h\"\n",
+  "#line 1409 \"trbvh.h\"\n",
   "#define TRB_LANE_LOAD(p)     (*(p))\n",
   "#define TRB_LANE_STORE(p, x) (*(p) = (x))\n",
   "#define TRB_LANE_OF(x)       (x)\n",
@@ -1205,7 +1207,7 @@ static const char *const trb_cl_text[] = {
   "  for (lane = 0; lane < lanes; lane++) trb_treelet_costs_1(leaves + lane, table + lane, sums + lane, costs);\n",
   "}\n",
   "#endif\n",
-  "#line 1537 \"trbvh.h\"\n",
+  "#line 1540 \"trbvh.h\"\n",
   "typedef struct trb_treelets {\n",
   "  float     leaves[TRB_TREELET * TRB_LEAF_VALUES * TRB_LANES];\n",
   "  float     table[TRB_SUBSETS * TRB_LANES + 16];\n",
@@ -1381,7 +1383,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "}\n",
   "#endif\n",
-  "#line 1721 \"trbvh.h\"\n",
+  "#line 1724 \"trbvh.h\"\n",
   "typedef struct trb_move {\n",
   "  trbvh_u32 node, target;\n",
   "  trbvh_u32 above;\n",
@@ -1542,7 +1544,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "}\n",
   "#endif\n",
-  "#line 1889 \"trbvh.h\"\n",
+  "#line 1892 \"trbvh.h\"\n",
   "#define TRB_MOVE_BATCHES 4u\n",
   "#define TRB_SCORES       2048u\n",
   "#define TRB_SCORE_SHIFT  20\n",
@@ -1580,7 +1582,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "TRB_CORE float trb_least_gain(trbvh_u32 lowest) { return trb_float(lowest << TRB_SCORE_SHIFT) * 0.0625f; }\n",
-  "#line 1931 \"trbvh.h\"\n",
+  "#line 1934 \"trbvh.h\"\n",
   "TRB_SHARED trb_move trb_find_place(const trb_mover *m, trbvh_u32 node, float least) {\n",
   "  const trbvh_node n = m->nodes[node];\n",
   "  const float area = trb_area(n);\n",
@@ -1693,7 +1695,7 @@ static const char *const trb_cl_text[] = {
   "        m->moves[at++].gain = 0;\n",
   "      }\n",
   "}\n",
-  "#line 2052 \"trbvh.h\"\n",
+  "#line 2055 \"trbvh.h\"\n",
   "#define TRB_UNSPLIT_BIAS 2.0f\n",
   "\n",
   "\n",
@@ -1788,7 +1790,29 @@ static const char *const trb_cl_text[] = {
   "  if (move->target == (move->node ^ 1u)) move->target = parent;\n",
   "  move->above = parent;\n",
   "}\n",
-  "#line 2161 \"trbvh.h\"\n",
+  "#line 2155 \"trbvh.h\"\n",
+  "#define TRB_SPLITS_PAY 0.98\n",
+  "\n",
+  "\n",
+  "TRB_CORE float trb_cost_unit(trbvh_node root, trb_costs costs) {\n",
+  "  return trb_unit(trb_area(root) * TRB_MAX(1.0f, 0.5f * costs.ratio * TRB_MAX_LEAF), 31);\n",
+  "}\n",
+  "\n",
+  "TRB_CORE trbvh_u32 trb_round_cost(float cost) { return (trbvh_u32)TRB_MIN(cost, 2147483520.0f); }\n",
+  "\n",
+  "\n",
+  "TRB_CORE trb_u64 trb_pair_cost(const TRB_GLOBAL trbvh_node *nodes, trbvh_u32 pair, float unit, trb_costs costs) {\n",
+  "  const trbvh_node left = nodes[2 * pair], right = nodes[2 * pair + 1];\n",
+  "  const trbvh_node parent = trb_parent(left, right, 0, costs);\n",
+  "  const float weight = 0.5f * costs.ratio * unit;\n",
+  "  trb_u64 cost = 0;\n",
+  "  if (trb_is_free(left) || trb_is_leaf(parent.count)) return 0;\n",
+  "  cost += trb_round_cost(unit * trb_area(parent));\n",
+  "  if (trb_is_leaf(left.count)) cost += trb_round_cost(weight * trb_area(left) * (float)trb_count(left.count));\n",
+  "  if (trb_is_leaf(right.count)) cost += trb_round_cost(weight * trb_area(right) * (float)trb_count(right.count));\n",
+  "  return cost;\n",
+  "}\n",
+  "#line 2191 \"trbvh.h\"\n",
   "typedef struct trb_collapser {\n",
   "  TRB_GLOBAL trbvh_node *nodes;\n",
   "  trb_words words;\n",
@@ -1986,7 +2010,7 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE void trb_prefetch_pairs(const trb_collapser *c, trbvh_u32 ref, trbvh_u32 count) {\n",
   "  for (; count-- && ref > 2 * TRB_AHEAD; ref--) TRB_PREFETCH(&c->nodes[2 * (ref - 2 * TRB_AHEAD)]);\n",
   "}\n",
-  "#line 2362 \"trbvh.h\"\n",
+  "#line 2392 \"trbvh.h\"\n",
   "TRB_SHARED void trb_settle_task(const trb_collapser *c, TRB_GLOBAL trb_task *task) {\n",
   "  TRB_GLOBAL trbvh_u32 *order = c->words.plane[0] + task->first_ref, *prims = c->words.plane[1] + task->first_ref;\n",
   "  trbvh_u32 waiting = 0, pairs = 0, refs = task->first_ref, prim = 0, max_depth = 0, i;\n",
@@ -2154,7 +2178,7 @@ static const char *const trb_cl_text[] = {
   "    default: trb_make_form(mesh, 4, prims, first, end, out); break;\n",
   "  }\n",
   "}\n",
-  "#line 2540 \"trbvh.h\"\n",
+  "#line 2570 \"trbvh.h\"\n",
   "#define TRB_UNIT 5.9604645e-8f\n",
   "#define TRB_ABS(x) ((x) < 0 ? -(x) : (x))\n",
   "typedef struct trb_ray {\n",
@@ -2232,7 +2256,7 @@ static const char *const trb_cl_text[] = {
   "  along = TRB_MIN(along, 1);\n",
   "  return TRB_MAX(along, 0);\n",
   "}\n",
-  "#line 2624 \"trbvh.h\"\n",
+  "#line 2654 \"trbvh.h\"\n",
   "TRB_CORE int trb_hit_triangle(const TRB_GLOBAL trbvh_triangle *t, const trb_ray *r, float tmax, trbvh_hit *hit) {\n",
   "  const int x = r->axis[0], y = r->axis[1], z = r->axis[2];\n",
   "  const trb_corner a = trb_see(t->v0[x], t->v0[y], t->v0[z], r);\n",
@@ -2273,7 +2297,7 @@ static const char *const trb_cl_text[] = {
   "  hit->u = hit->v = 0;\n",
   "  hit->prim = hit->instance = TRBVH_NONE;\n",
   "}\n",
-  "#line 2668 \"trbvh.h\"\n",
+  "#line 2698 \"trbvh.h\"\n",
   "TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbvh_triangle *triangles,\n",
   "                       const trb_ray *r, int any, trbvh_hit *hit) {\n",
   "  trbvh_u32 stack_node[TRBVH_MAX_DEPTH], height = 0, node = 0, i;\n",
@@ -2334,6 +2358,7 @@ static const char *const trb_cl_text[] = {
   "typedef struct trb_plan {\n",
   "  trb_u64      position_offset, position_stride, index_offset;\n",
   "  trb_u64      scale;\n",
+  "  trb_u64      cost;\n",
   "  trb_costs    costs;\n",
   "  trb_key_form form;\n",
   "  float        cost_node, cost_prim;\n",
@@ -2442,6 +2467,20 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "\n",
   "\n",
+  "static ulong trb_sum_group(ulong mine, __local ulong *space) {\n",
+  "#ifndef TRB_CPU\n",
+  "  uint half_size;\n",
+  "  for (half_size = TRB_GROUP / 2; half_size; half_size /= 2) {\n",
+  "    TRB_SYNC();\n",
+  "    if (TRB_LOCAL_ID >= half_size && TRB_LOCAL_ID < 2 * half_size) space[TRB_LOCAL_ID - half_size] = mine;\n",
+  "    TRB_SYNC();\n",
+  "    if (TRB_LOCAL_ID < half_size) mine += space[TRB_LOCAL_ID];\n",
+  "  }\n",
+  "#endif\n",
+  "  return mine;\n",
+  "}\n",
+  "\n",
+  "\n",
   "static trb_mesh trb_plan_mesh(const __global trb_plan *plan, const __global char *positions, const __global char *indices) {\n",
   "  trb_mesh mesh;\n",
   "  mesh.positions = plan->boxes ? 0 : positions + plan->position_offset;\n",
@@ -2482,7 +2521,7 @@ static const char *const trb_cl_text[] = {
   "  c.prims = prims;\n",
   "  return c;\n",
   "}\n",
-  "#line 107 \"kernels/shape.cl\"\n",
+  "#line 121 \"kernels/shape.cl\"\n",
   "static uint trb_reserve(volatile __global uint *end, uint count, __local uint *space) {\n",
   "#ifdef TRB_CPU\n",
   "  return count ? atomic_add(end, count) : 0;\n",
@@ -2635,19 +2674,6 @@ static const char *const trb_cl_text[] = {
   "  plan->scale_low = 0;\n",
   "}\n",
   "\n",
-  "\n",
-  "static ulong trb_sum_group(ulong mine, __local ulong *space) {\n",
-  "#ifndef TRB_CPU\n",
-  "  uint half_size;\n",
-  "  for (half_size = TRB_GROUP / 2; half_size; half_size /= 2) {\n",
-  "    TRB_SYNC();\n",
-  "    if (TRB_LOCAL_ID >= half_size && TRB_LOCAL_ID < 2 * half_size) space[TRB_LOCAL_ID - half_size] = mine;\n",
-  "    TRB_SYNC();\n",
-  "    if (TRB_LOCAL_ID < half_size) mine += space[TRB_LOCAL_ID];\n",
-  "  }\n",
-  "#endif\n",
-  "  return mine;\n",
-  "}\n",
   "\n",
   "TRB_KERNEL trb_k_sum_splits(const __global trb_plan *plan, const __global float *priorities, __global ulong *sums, uint step) {\n",
   "  __local ulong space[TRB_GROUP];\n",
@@ -3202,6 +3228,31 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "\n",
   "\n",
+  "\n",
+  "TRB_KERNEL trb_k_sum_costs(const __global trb_plan *plan, const __global trbvh_node *nodes, __global ulong *sums) {\n",
+  "  __local ulong space[TRB_GROUP];\n",
+  "  const trb_costs costs = plan->costs;\n",
+  "  const float unit = plan->ref_count ? trb_cost_unit(nodes[0], costs) : 0;\n",
+  "  const uint count = plan->ref_count;\n",
+  "  ulong sum = 0;\n",
+  "  uint i;\n",
+  "  TRB_FOR(i, count)\n",
+  "    if (i) sum += trb_pair_cost(nodes, i, unit, costs);\n",
+  "  sum = trb_sum_group(sum, space);\n",
+  "  if (TRB_LOCAL_ID == 0) sums[TRB_GROUP_ID] = sum;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_add_costs(__global trb_plan *plan, const __global ulong *sums, uint count) {\n",
+  "  __local ulong space[TRB_GROUP];\n",
+  "  ulong sum = 0;\n",
+  "  uint i;\n",
+  "  for (i = TRB_LOCAL_ID; i < count; i += TRB_GROUP) sum += sums[i];\n",
+  "  sum = trb_sum_group(sum, space);\n",
+  "  if (TRB_LOCAL_ID == 0) plan->cost = sum;\n",
+  "}\n",
+  "\n",
+  "\n",
   "TRB_KERNEL trb_k_search(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
   "                        __global ulong *sorted, uint batch) {\n",
   "  const trb_mover m = trb_plan_mover(plan, nodes, 0, keys, sorted);\n",
@@ -3736,9 +3787,9 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "#endif\n",
 };
-#define TRB_CL_CORE_LINES 2271u   /* entries of trb_cl_text for user kernels: types, core, traversal */
-#define TRB_CL_LINES      3618u   /* all entries */
-#define TRB_CL_HASH       "eb0f8185f15cd644"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_CORE_LINES 2295u   /* entries of trb_cl_text for user kernels: types, core, traversal */
+#define TRB_CL_LINES      3668u   /* all entries */
+#define TRB_CL_HASH       "0a441244af6a66e7"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
@@ -3972,7 +4023,8 @@ static int trb_cl_load(trb_cl_api *api, trbvh_stats *stats) {
   X(MOVES, forget_refs, "bb")         X(MOVES, find_refs, "bbbbb")        X(MOVES, search_merges, "bbbbbu") \
   X(MOVES, claim_gains, "bbbbb")      X(MOVES, claim_pairs, "bbbbb")      X(MOVES, stand_back, "bbbb") \
   X(MOVES, follow, "bbbb")            X(MOVES, release, "bbbbb")          X(MOVES, move, "bbbbbu") \
-  X(MOVES, remake_level, "bbbbu")     X(MOVES, remake_levels, "bbbbu") \
+  X(MOVES, remake_level, "bbbbu")     X(MOVES, remake_levels, "bbbbu")    X(MOVES, sum_costs, "bbb") \
+  X(MOVES, add_costs, "bbu") \
   X(BUILD, find_tasks, "bbbbbb")      X(BUILD, settle_groups, "bbbbbbb")  X(BUILD, sum_tasks, "bb") \
   X(BUILD, emit_top, "bbbbbbb")       X(BUILD, emit_tasks, "bbbbbbb") \
   X(BUILD, first_inner, "bbbbb")      X(BUILD, list_inner, "bbbbbbbu")    X(BUILD, list_rest, "bbbbbbbu") \
@@ -4646,11 +4698,12 @@ static void trb_cl_send_plan(trb_cl_work *w) {
   p->cost_prim = b->options.cost_prim;
   p->prim_count = b->input.count;
   p->boxes = b->input.boxes != NULL;
-  p->split_max = b->split_max;
+  p->split_max = b->splitting ? b->split_max : 0;
   p->ref_max = b->ref_max;
   p->reinsert_share = b->options.reinsert_share;
   p->index_size = b->input.indices ? b->input.index_size : 0;
   p->position_count = b->input.position_count;
+  trb_cl_release(w->cl, &w->state);
   w->state = trb_cl_buffer(w->cl, TRB_CL_MEM_READ_WRITE | TRB_CL_MEM_COPY_HOST_PTR, sizeof *p, p);
 }
 
@@ -4658,7 +4711,7 @@ static void trb_cl_send_plan(trb_cl_work *w) {
 static void trb_cl_read_mesh(trb_cl_work *w) {
   trb_cl *cl = w->cl;
   const uint32_t groups = trb_cl_spread(cl, w->b->input.count);
-  trb_cl_launch(cl, TRB_CL_BUILD_read, groups, w->state, w->positions, w->indices, w->b->split_max ? w->nodes : w->refs,
+  trb_cl_launch(cl, TRB_CL_BUILD_read, groups, w->state, w->positions, w->indices, w->b->splitting ? w->nodes : w->refs,
                 w->partials);
   trb_cl_launch(cl, TRB_CL_BUILD_grid, 1, w->state, w->partials, groups);
 }
@@ -4838,12 +4891,11 @@ static trbvh_result trb_cl_reinsert(trb_cl_work *w) {
 static trbvh_result trb_cl_unsplit(trb_cl_work *w) {
   const uint32_t groups = trb_cl_search_groups(w, TRB_MOVES_MAX(w->b->ref_max), 1);
   trb_cl *cl = w->cl;
-  int32_t pass;
-  uint32_t batch;
+  uint32_t pass, batch;
   trb_cl_launch(cl, TRB_CL_MOVES_forget_refs, w->spread, w->state, w->refs);
   trb_cl_launch(cl, TRB_CL_MOVES_find_refs, w->spread, w->state, w->nodes, w->refs, w->keys, w->sorted);
   trb_cl_start_moves(w);
-  for (pass = 0; pass < w->b->options.unsplit_passes; pass++)
+  for (pass = 0; pass < w->b->phase.unsplits; pass++)
     for (batch = 0; batch < TRB_MOVE_BATCHES; batch++) {
       trb_cl_launch(cl, TRB_CL_MOVES_search_merges, groups, w->state, w->nodes, w->refs, w->keys, w->sorted, batch);
       trb_cl_move(w, 1);
@@ -4854,9 +4906,24 @@ static trbvh_result trb_cl_unsplit(trb_cl_work *w) {
 
 /* What comes before the rounds of a phase, as in C. */
 static trbvh_result trb_cl_make_moves(trb_cl_work *w, uint32_t phase) {
-  const int merges = w->b->split_max && w->b->options.unsplit_passes;
-  trbvh_result result = merges ? trb_cl_unsplit(w) : TRBVH_OK;
-  return !result && (merges || phase) ? trb_cl_reinsert(w) : result;
+  const uint32_t unsplits = w->b->phase.unsplits;
+  trbvh_result result = unsplits ? trb_cl_unsplit(w) : TRBVH_OK;
+  return !result && (unsplits || phase) ? trb_cl_reinsert(w) : result;
+}
+
+static trbvh_result trb_cl_too_deep(trb_cl_work *w) {
+  return trb_fail(w->b, TRBVH_DEVICE_ERROR, "the tree is too deep for this device", 0, 0, 0);
+}
+
+/* What trb_sum_costs finds; waits. */
+static trbvh_result trb_cl_sum_costs(trb_cl_work *w, double *cost) {
+  trb_plan found;
+  memset(&found, 0, sizeof found);
+  trb_cl_launch(w->cl, TRB_CL_MOVES_sum_costs, w->spread, w->state, w->nodes, w->partials);
+  trb_cl_launch(w->cl, TRB_CL_MOVES_add_costs, 1, w->state, w->partials, w->spread);
+  trb_cl_read(w->cl, w->state, &found, sizeof found);
+  *cost = (double)found.cost;
+  return found.too_deep ? trb_cl_too_deep(w) : TRBVH_OK;
 }
 
 /* ---- Treelets ---- */
@@ -4955,30 +5022,50 @@ static trbvh_result trb_cl_end_stage(trb_cl_work *w, float share, double *ms, do
     if (!result) result = trb_cl_end_stage(w, share, &w->b->stats.ms, &start); \
   }
 
+static trbvh_result trb_cl_run_phase(trb_cl_work *w, uint32_t phase) {
+  const float share = 0.1f * w->b->effort / (float)trb_phases(w->b);
+  trbvh_result result = TRBVH_OK;
+  double start = trb_ms();
+  trb_start_phase(w->b, phase);
+  TRB_CL_STAGE(0, ms_moves, result = trb_cl_make_moves(w, phase))
+  if (w->b->phase.rounds) { TRB_CL_STAGE(share, ms_treelets, result = trb_cl_restructure(w)) }
+  return result;
+}
+
+/* As in C. */
+static trbvh_result trb_cl_attempt(void *worker, int splitting, double *cost) {
+  trb_cl_work *w = (trb_cl_work *)worker;
+  const float effort = w->b->effort;
+  trbvh_result result;
+  uint32_t phase;
+  double start = trb_ms();
+  trb_start_attempt(w->b, splitting);
+  trb_cl_send_plan(w);
+  result = trb_cl_end_stage(w, 0.05f * effort, &w->b->stats.ms_transfer, &start);
+  TRB_CL_STAGE(0.05f * effort, ms_morton, trb_cl_read_mesh(w))
+  if (splitting) { TRB_CL_STAGE(0.1f, ms_split, trb_cl_split(w)) }
+  TRB_CL_STAGE(0.05f * effort, ms_morton, trb_cl_make_keys(w))
+  TRB_CL_STAGE(0.1f * effort, ms_sort, trb_cl_sort_keys(w))
+  TRB_CL_STAGE(0.1f * effort, ms_hierarchy, trb_cl_build_hierarchy(w))
+  for (phase = 0; !result && phase + 1 < trb_phases(w->b); phase++) result = trb_cl_run_phase(w, phase);
+  start = trb_ms();
+  if (cost) { TRB_CL_STAGE(0, ms_split, result = trb_cl_sum_costs(w, cost)) }
+  return result;
+}
+
 /* Everything up to the size of the result; then w->plan has the counts. */
 static trbvh_result trb_cl_run_to_counts(trb_cl_work *w) {
   const trb_build *b = w->b;
   const trb_plan *p = &w->plan;
-  const uint32_t phases = trb_phases(b);
-  uint32_t phase;
   trbvh_result result;
-  double start = trb_ms();
+  double start;
   trb_cl_make_buffers(w);
-  trb_cl_send_plan(w);
-  result = trb_cl_end_stage(w, 0.05f, &w->b->stats.ms_transfer, &start);
-  TRB_CL_STAGE(0.05f, ms_morton, trb_cl_read_mesh(w))
-  if (b->split_max) { TRB_CL_STAGE(0.1f, ms_split, trb_cl_split(w)) }
-  TRB_CL_STAGE(0.05f, ms_morton, trb_cl_make_keys(w))
-  TRB_CL_STAGE(0.1f, ms_sort, trb_cl_sort_keys(w))
-  TRB_CL_STAGE(0.1f, ms_hierarchy, trb_cl_build_hierarchy(w))
-  for (phase = 0; phase < phases; phase++) {
-    trb_start_phase(w->b, phase);
-    TRB_CL_STAGE(0, ms_moves, result = trb_cl_make_moves(w, phase))
-    if (b->phase.rounds) { TRB_CL_STAGE(0.1f / (float)phases, ms_treelets, result = trb_cl_restructure(w)) }
-  }
+  result = trb_attempt_both(w->b, trb_cl_attempt, w);
+  if (!result) result = trb_cl_run_phase(w, trb_phases(b) - 1);
+  start = trb_ms();
   TRB_CL_STAGE(0.1f, ms_collapse, (trb_cl_count_tree(w), trb_cl_read(w->cl, w->state, &w->plan, sizeof w->plan)))
   if (result) return result;
-  if (p->too_deep) return trb_fail(w->b, TRBVH_DEVICE_ERROR, "the tree is too deep for this device", 0, 0, 0);
+  if (p->too_deep) return trb_cl_too_deep(w);
   if (p->skipped > b->input.count || p->prims < b->input.count - p->skipped || p->prims > p->ref_count ||
       p->ref_count > b->ref_max || p->leaves > p->prims || (p->prims == 0) != (p->leaves == 0) ||
       p->max_depth > TRBVH_MAX_DEPTH)

@@ -89,6 +89,31 @@ TRB_KERNEL trb_k_list_candidates(__global trb_plan *plan, __global trbvh_node *n
   if (TRB_LOCAL_ID == 0 && TRB_GROUP_ID == (uint)get_num_groups(0) - 1) plan->moves = min(start, most);
 }
 
+/* ---- What a tree costs ---- */
+/* One sum for each work-group. */
+TRB_KERNEL trb_k_sum_costs(const __global trb_plan *plan, const __global trbvh_node *nodes, __global ulong *sums) {
+  __local ulong space[TRB_GROUP];
+  const trb_costs costs = plan->costs;
+  const float unit = plan->ref_count ? trb_cost_unit(nodes[0], costs) : 0;
+  const uint count = plan->ref_count;
+  ulong sum = 0;
+  uint i;
+  TRB_FOR(i, count)
+    if (i) sum += trb_pair_cost(nodes, i, unit, costs);        /* the root's pair has no other node */
+  sum = trb_sum_group(sum, space);
+  if (TRB_LOCAL_ID == 0) sums[TRB_GROUP_ID] = sum;
+}
+
+/* One work-group. */
+TRB_KERNEL trb_k_add_costs(__global trb_plan *plan, const __global ulong *sums, uint count) {
+  __local ulong space[TRB_GROUP];
+  ulong sum = 0;
+  uint i;
+  for (i = TRB_LOCAL_ID; i < count; i += TRB_GROUP) sum += sums[i];
+  sum = trb_sum_group(sum, space);
+  if (TRB_LOCAL_ID == 0) plan->cost = sum;
+}
+
 /* ---- The best move of each candidate ---- */
 TRB_KERNEL trb_k_search(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
                         __global ulong *sorted, uint batch) {

@@ -57,6 +57,20 @@ static uint trb_scan(uint value, __local uint *space, uint *total) {
 #endif
 }
 
+/* The sum over a group; its first work-item gets it. */
+static ulong trb_sum_group(ulong mine, __local ulong *space) {
+#ifndef TRB_CPU
+  uint half_size;
+  for (half_size = TRB_GROUP / 2; half_size; half_size /= 2) {
+    TRB_SYNC();
+    if (TRB_LOCAL_ID >= half_size && TRB_LOCAL_ID < 2 * half_size) space[TRB_LOCAL_ID - half_size] = mine;
+    TRB_SYNC();
+    if (TRB_LOCAL_ID < half_size) mine += space[TRB_LOCAL_ID];
+  }
+#endif
+  return mine;
+}
+
 /* The mesh that a plan tells of. */
 static trb_mesh trb_plan_mesh(const __global trb_plan *plan, const __global char *positions, const __global char *indices) {
   trb_mesh mesh;

@@ -32,19 +32,6 @@ TRB_KERNEL trb_k_priority_unit(__global trb_plan *plan, const __global trb_parti
 }
 
 /* The search tries TRB_CANDIDATES scales at once, `step` numbers apart; three times, from far apart to neighbours. */
-static ulong trb_sum_group(ulong mine, __local ulong *space) {
-#ifndef TRB_CPU
-  uint half_size;
-  for (half_size = TRB_GROUP / 2; half_size; half_size /= 2) {
-    TRB_SYNC();
-    if (TRB_LOCAL_ID >= half_size && TRB_LOCAL_ID < 2 * half_size) space[TRB_LOCAL_ID - half_size] = mine;
-    TRB_SYNC();
-    if (TRB_LOCAL_ID < half_size) mine += space[TRB_LOCAL_ID];
-  }
-#endif
-  return mine;
-}
-
 TRB_KERNEL trb_k_sum_splits(const __global trb_plan *plan, const __global float *priorities, __global ulong *sums, uint step) {
   __local ulong space[TRB_GROUP];
   const float unit = plan->priority_unit;

@@ -662,7 +662,7 @@ static void test_trees_on_the_device(void)
         stub_quiet();
         result = trbvh_cl_build(o.device, &twin, &cl, &options, NULL);
         CHECK_MSG(result == TRBVH_OK, "twin %d: %s", again, trbvh_result_text(result));
-        CHECK_MSG(stub.waits <= 1, "waited %u times for the device", stub.waits);
+        CHECK_MSG(stub.waits <= (preset < 2 ? 1u : 3u), "waited %u times for the device", stub.waits);   /* do splits pay? */
       }
       check_tree_on_device(&o, &tree, &m.tree, "built on the device");
       trbvh_cl_free(o.device, &tree);

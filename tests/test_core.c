@@ -1474,6 +1474,20 @@ static uint32_t check_moved(const trb_build *b, uint32_t node, unsigned char *pr
   CHECK_MSG(!memcmp(&made, n, sizeof made), "node %u is not what its children make it", node);
   return count;
 }
+static double tree_cost(const trb_build *b, uint32_t node) {
+  const trbvh_node *n = &b->nodes[node];
+  double cost = 0;
+  uint32_t side;
+  if (trb_is_single(n->count)) return 0;
+  for (side = 0; side < 2; side++) {
+    const trbvh_node *child = &b->nodes[n->first + side];
+    if (trb_is_leaf(child->count) && !trb_is_leaf(n->count))
+      cost += 0.5 * (double)b->costs.ratio * (double)trb_area(*child) * trb_count(child->count);
+    cost += tree_cost(b, n->first + side);
+  }
+  return trb_is_leaf(n->count) ? cost : cost + (double)trb_area(*n);
+}
+
 static void test_moved_trees(void) {
   trbvh_node *boxes = (trbvh_node *)xmalloc(BOXES * sizeof *boxes);
   float *memory = (float *)xmalloc(BOXES * 36);
@@ -1483,7 +1497,7 @@ static void test_moved_trees(void) {
     trbvh_options o;
     trbvh_geometry g;
     trb_build b;
-    double before, after;
+    double before, after, cost;
     double_box box;
     CONTEXT("kind %u", kind);
     memset(&o, 0, sizeof o);
@@ -1513,6 +1527,9 @@ static void test_moved_trees(void) {
     CHECK(trb_count(b.nodes[0].count) == b.ref_count - passed);
     for (i = 0; i < n; i++) CHECK_MSG(prims[i], "primitive %u is lost", i);
     for (i = 0; i < b.ref_count; i++) CHECK_MSG(trb_build_mover(&b).owners[i] == TRBVH_NONE, "pair %u is owned", i);
+    CHECK(!trb_sum_costs(&b, &cost));
+    cost /= (double)trb_cost_unit(b.nodes[0], b.costs);
+    CHECK_MSG(fabs(cost - tree_cost(&b, 0)) <= 1e-5 * cost, "cost %g, not %g", cost, tree_cost(&b, 0));
     after = area_after(b.nodes, 0, TRBVH_NONE, TRBVH_NONE, &box);
     CHECK_MSG(after <= before && (after < before || (kind >= 2 && kind < 5)), "%g before, %g after", before, after);
     end_build(&b);
