@@ -246,6 +246,12 @@ typedef struct trbvh {
  * most: the scratch memory, freed before it returns, and the tree's block, which a later build reuses where it fits;
  * with options.scratch, a build into such a tree allocates nothing. */
 TRBVH_API trbvh_result trbvh_build   (trbvh *bvh, const trbvh_geometry *geometry, const trbvh_options *options);
+/* Restructures a tree that exists, from a faster preset, say, or refitted, or from elsewhere: the rounds, and with them
+ * the moves, of a preset without splits. Only nodes[] changes, in place: leaves keep their boxes and their parts of
+ * prims[] and triangles[]. Of options: quality, treelet_rounds, treelet_gamma, reinsert_share; jobs, allocator and
+ * scratch (what a build with as many leaves asks for, or some more: 97 bytes a leaf), progress, stats; the costs for
+ * stats->sah_cost. On failure the tree is as it was; BAD_DATA where nodes[] is not a tree. */
+TRBVH_API trbvh_result trbvh_optimize(trbvh *bvh, const trbvh_options *options);
 TRBVH_API void         trbvh_free    (trbvh *bvh);                                           /* {0} is fine, twice is fine */
 TRBVH_API size_t       trbvh_bytes_bound(const trbvh_geometry *geometry, const trbvh_options *options, size_t *scratch); /* most that a build will ask for, of the block (returned) and of scratch memory (may be NULL); 0, 0 where the arguments are invalid or too large */
 TRBVH_API double       trbvh_sah     (const trbvh *bvh, float cost_node, float cost_prim);   /* paper's equation 1; 0, 0 = 1.2, 1.0 */
@@ -2188,6 +2194,8 @@ TRB_CORE trb_u64 trb_pair_cost(const TRB_GLOBAL trbvh_node *nodes, trbvh_u32 pai
  * The depth bound: a node at depth d with n references can always be made a balanced subtree that ends at depth
  * d + ceil(log2 n). Where a child could no longer be made so within TRBVH_MAX_DEPTH, its parent still can, and is. As
  * this holds at the root, it holds everywhere. */
+typedef struct trb_held { trbvh_u32 first, count; } trb_held;
+
 typedef struct trb_collapser {
   TRB_GLOBAL trbvh_node *nodes;
   trb_words words;
@@ -2197,6 +2205,7 @@ typedef struct trb_collapser {
   const TRB_GLOBAL trb_u64 *keys;        /* sorted, of a final tree: ref_count, of this form */
   trb_key_form form;
   trbvh_u32    ref_count;
+  const TRB_GLOBAL trb_held *held;       /* of a tree that is optimized: what its leaves hold; else NULL */
   TRB_GLOBAL trbvh_node *out;            /* the result, once it is allocated */
   TRB_GLOBAL trbvh_u32  *prims;
 } trb_collapser;
@@ -2460,9 +2469,32 @@ TRB_SHARED void trb_emit_top(const trb_collapser *c, TRB_GLOBAL trb_task *tasks,
   }
 }
 
+/* The other way round: a node of a tree that is to be optimized. What a leaf holds goes aside, and the leaf becomes a
+ * reference, known by its number; an inner node waits for trb_remake. */
+TRB_CORE trbvh_node trb_unsettle(trbvh_node node, trbvh_u32 number, TRB_GLOBAL trb_held *held, trb_costs costs) {
+  trbvh_u32 k;
+  held->first = node.first;
+  held->count = node.count;
+  if (node.count == 0) return node;
+  for (k = 0; k < 3; k++) { node.min[k] += TRB_PLUS_ZERO; node.max[k] += TRB_PLUS_ZERO; }    /* they may be anybody's */
+  node.first = number;
+  return trb_reference(node, costs);
+}
+
+/* Such a leaf afterwards: it keeps what it holds. */
+TRB_CORE void trb_emit_old_leaf(const trb_collapser *c, trbvh_node leaf, trbvh_u32 number, trbvh_u32 dst) {
+  leaf.first = c->held[number].first;
+  leaf.count = c->held[number].count;
+  c->out[dst] = leaf;
+}
+
 /* Writes one of a task's nodes. */
 TRB_CORE void trb_emit_settled(const trb_collapser *c, const trb_task *task, trbvh_u32 src, trbvh_u32 dst) {
   trbvh_node node = c->nodes[src];
+  if (c->held && node.count) {
+    trb_emit_old_leaf(c, node, c->words.plane[1][task->first_ref + node.first], dst);
+    return;
+  }
   node.first = node.count ? task->first_prim + node.first : 2 * (task->pair + node.first);
   c->out[dst] = node;
 }
@@ -2477,7 +2509,7 @@ TRB_SHARED void trb_emit_task(const trb_collapser *c, trb_task task) {
     trb_emit_settled(c, &task, order[i], 2 * (task.pair + i));
     trb_emit_settled(c, &task, order[i] + 1, 2 * (task.pair + i) + 1);
   }
-  for (i = 0; i < task.prims; i++) c->prims[task.first_prim + i] = prims[i];
+  for (i = 0; i < task.prims && !c->held; i++) c->prims[task.first_prim + i] = prims[i];
 }
 
 /* The same in a final tree, where pairs stand in the opposite order, by the numbers that they have there. */
@@ -3084,6 +3116,7 @@ typedef struct trb_build {
   int                   splitting;       /* is this attempt's tree one with splits? */
   float                 effort;          /* of all that grows trees, this attempt */
   int                   final;           /* the hierarchy's topology is the result's */
+  int                   optimizes;       /* there is a tree already */
   int                   guessed;         /* trb_read has made the keys */
   /* scratch memory; what stands on one line shares it, one after the other */
   void                 *scratch;
@@ -3097,6 +3130,7 @@ typedef struct trb_build {
                                                                                  trb_u64 *sums;
   trb_group            *groups;
   trb_task             *tasks;
+  trb_held             *held;             /* by node, of a tree that is optimized */
   uint32_t              block_count, task_count, group_count;
   double                sah;             /* equation 1's sum above the tasks */
   struct { uint32_t last, unsplits, gamma, rounds; } phase;
@@ -3252,6 +3286,7 @@ static size_t trb_lay_out(trb_build *b, char *base) {
   TRB_PART(ranges,     trb_range,  blocks * sizeof(trb_range))
   TRB_PART(groups,     trb_group,  TRB_GROUPS_MAX(n) * sizeof(trb_group))
   TRB_PART(tasks,      trb_task,   TRB_TASKS_MAX(n) * sizeof(trb_task))
+  TRB_PART(held,       trb_held,   b->optimizes ? n * 2 * sizeof(trb_held) : 0)
   #undef TRB_PART
   b->priorities = (float *)(void *)b->keys;
   b->unsplit = b->nodes;
@@ -3844,6 +3879,7 @@ static trb_collapser trb_start_collapse(const trb_build *b) {
   c.keys = b->keys;
   c.form = b->key_form;
   c.ref_count = b->ref_count;
+  c.held = b->optimizes ? b->held : NULL;
   c.out = (trbvh_node *)(uintptr_t)b->tree.nodes;
   c.prims = (uint32_t *)(uintptr_t)b->tree.prims;
   return c;
@@ -3916,8 +3952,18 @@ static double trb_exact_sah(const trb_build *b) {
   return trbvh_sah(&b->tree, node > 0 ? node : -1, prim > 0 ? prim : -1);
 }
 
+/* Into the tree's nodes and, unless they stay, its prims. */
+static trbvh_result trb_emit_nodes(trb_build *b) {
+  const trb_collapser c = trb_start_collapse(b);
+  uint32_t i;
+  memset(&c.out[1], 0, TRB_NODE_BYTES);
+  trb_emit_top(&c, b->tasks, b->task_count);
+  if (trb_run(&b->runner, b->group_count, trb_emit_job, b)) return TRBVH_CANCELLED;
+  for (i = 0; i < b->task_count; i++) b->stats.max_depth = TRB_MAX(b->tasks[i].max_depth, b->stats.max_depth);
+  return TRBVH_OK;
+}
+
 static trbvh_result trb_emit(trb_build *b, trbvh *bvh) {
-  trb_collapser c;
   uint32_t leaves = 0, prims = 0, i;
   trbvh_result result;
   double sah = b->sah;
@@ -3927,15 +3973,9 @@ static trbvh_result trb_emit(trb_build *b, trbvh *bvh) {
     prims += b->tasks[i].prims;
   }
   result = trb_make_room(b, bvh, leaves, prims);
+  if (!result) result = trb_emit_nodes(b);
   if (result) return result;
-  c = trb_start_collapse(b);
-  memset(&c.out[1], 0, TRB_NODE_BYTES);
-  trb_emit_top(&c, b->tasks, b->task_count);
-  if (trb_run(&b->runner, b->group_count, trb_emit_job, b)) return TRBVH_CANCELLED;
-  for (i = 0; i < b->task_count; i++) {
-    sah += b->tasks[i].sah;
-    b->stats.max_depth = TRB_MAX(b->tasks[i].max_depth, b->stats.max_depth);
-  }
+  for (i = 0; i < b->task_count; i++) sah += b->tasks[i].sah;
   b->stats.sah_cost = trb_fits_areas(root) ? sah / root : trb_exact_sah(b);
   return TRBVH_OK;
 }
@@ -4132,6 +4172,93 @@ TRBVH_API trbvh_result trbvh_build(trbvh *bvh, const trbvh_geometry *geometry, c
     b.stats.ms_total = trb_ms() - start;
     *options->stats = b.stats;
   }
+  return result;
+}
+
+// >>optimize ---- a tree that exists, whose leaves are the references ------------------------------------------------
+/* As a build of the leaves' boxes, none of which is to share a leaf with another. */
+static trbvh_result trb_resolve_optimize(trb_build *b, const trbvh *bvh, const trbvh_options *options) {
+  trbvh_geometry leaves;
+  trbvh_options o;
+  trbvh_result result;
+  memset(&o, 0, sizeof o);
+  if (options) o = *options;
+  o.max_leaf = 1;
+  memset(&leaves, 0, sizeof leaves);
+  if (bvh) {
+    leaves.boxes = bvh->nodes;           /* they are not read as such */
+    leaves.count = bvh->nodes ? bvh->node_count / 2 : 0;
+  }
+  result = trb_resolve(b, &leaves, &o);
+  b->optimizes = 1;
+  b->final = 0;
+  return bvh ? result : trb_fail(b, TRBVH_INVALID_ARGUMENT, "bvh is NULL", 0, 0, 0);
+}
+
+static trbvh_result trb_open_node(trb_build *b, const trbvh *bvh, uint32_t i) {
+  trbvh_node n = bvh->nodes[i];
+  if (n.count > bvh->ref_count || (n.count && n.first > bvh->ref_count - n.count))
+    return trb_fail(b, TRBVH_BAD_DATA, "leaf %u reaches beyond the %u primitives", i, bvh->ref_count, 0);
+  b->nodes[i] = trb_unsettle(n, i, &b->held[i], b->costs);
+  return TRBVH_OK;
+}
+
+/* Inner nodes are listed from the root down, whatever their order, and made from their children in the opposite order. */
+static trbvh_result trb_open_tree(trb_build *b, const trbvh *bvh) {
+  const trb_mover m = trb_build_mover(b);
+  uint32_t *list = m.list, *seen = m.owners, count = 0, pairs = bvh->node_count / 2, i, side;
+  trbvh_result result = trb_open_node(b, bvh, 0);
+  b->ref_count = pairs;
+  memset(seen, 0, (size_t)pairs * sizeof *seen);
+  if (bvh->nodes[0].count == 0) list[count++] = 0;
+  for (i = 0; i < count && !result; i++) {
+    const uint32_t pair = bvh->nodes[list[i]].first;
+    if (pair % 2 || pair == 0 || pair / 2 >= pairs || count == pairs || seen[pair / 2]++)
+      return trb_fail(b, TRBVH_BAD_DATA, "node %u: its children at %u are another node's, or none", list[i], pair, 0);
+    for (side = 0; side < 2 && !result; side++) {
+      result = trb_open_node(b, bvh, pair + side);
+      if (bvh->nodes[pair + side].count == 0 && count < pairs) list[count++] = pair + side;
+    }
+  }
+  if (!result && count + 1 != pairs)
+    return trb_fail(b, TRBVH_BAD_DATA, "%u pairs of nodes, but %u are children", pairs - 1, count, 0);
+  while (count-- && !result) trb_remake(&m, list[count]);
+  return result;
+}
+
+static trbvh_result trb_optimize(trb_build *b, trbvh *bvh) {
+  trbvh_result result = trb_allocate_scratch(b);
+  uint32_t phase;
+  trb_start_attempt(b, 0);
+  b->effort = 1;
+  TRB_STAGE(0.2f, ms_hierarchy, trb_open_tree(b, bvh))
+  for (phase = 0; !result && phase < trb_phases(b); phase++) result = trb_run_phase(b, phase);
+  if (!result && trb_stage(&b->runner, 0)) result = TRBVH_CANCELLED;
+  b->options.progress = NULL;            /* not to be cancelled any more: the tree changes */
+  b->tree = *bvh;
+  TRB_STAGE(0, ms_collapse, trb_emit_nodes(b))
+  return result;
+}
+
+TRBVH_API trbvh_result trbvh_optimize(trbvh *bvh, const trbvh_options *options) {
+  trb_build b;
+  const double start = trb_ms();
+  trbvh_result result = trb_resolve_optimize(&b, bvh, options);
+  if (!result && b.input.count) {
+    trb_runner_start(&b.runner, &b.options, b.input.count > TRB_BLOCK);
+    result = trb_optimize(&b, bvh);
+    trb_runner_stop(&b.runner);
+    trb_free_scratch(&b);
+  }
+  if (!result) {
+    b.stats.node_count = bvh->node_count;
+    b.stats.leaf_count = bvh->node_count / 2;
+    b.stats.ref_count = bvh->ref_count;
+    b.stats.sah_cost = trb_exact_sah(&b);
+  }
+  if (result && !b.stats.message[0]) trb_fail(&b, result, trbvh_result_text(result), 0, 0, 0);
+  b.stats.ms_total = trb_ms() - start;
+  if (options && options->stats) *options->stats = b.stats;
   return result;
 }
 
