@@ -2292,12 +2292,34 @@ TRB_CORE trbvh_u32 trb_leaf_prims(const trb_collapser *c, trbvh_node leaf, trbvh
 
 /* A node's part in equation 1's sum, with half areas. */
 TRB_CORE TRB_REAL trb_sah_term(trbvh_node node, TRB_REAL weight) { return weight * trb_area(node); }
+TRB_CORE TRB_REAL trb_leaf_term(const trb_collapser *c, trbvh_node leaf, trbvh_u32 prims) {
+  return trb_sah_term(leaf, (TRB_REAL)c->cost_prim * (c->held ? c->held[leaf.first].count : prims));
+}
 
 /* Writes an inner node whose children will be pair number `pair`. */
 TRB_CORE void trb_emit_inner(const trb_collapser *c, trbvh_node node, trbvh_u32 dst, trbvh_u32 pair) {
   node.first = 2 * pair;
   node.count = 0;
   c->out[dst] = node;
+}
+
+/* A node of a tree that is to be optimized. What a leaf holds goes aside, and the leaf becomes a reference, known by its
+ * number; an inner node is still to be made from its children. */
+TRB_CORE trbvh_node trb_unsettle(trbvh_node node, trbvh_u32 number, TRB_GLOBAL trb_held *held, trb_costs costs) {
+  trbvh_u32 k;
+  held->first = node.first;
+  held->count = node.count;
+  if (node.count == 0) return node;
+  for (k = 0; k < 3; k++) { node.min[k] += TRB_PLUS_ZERO; node.max[k] += TRB_PLUS_ZERO; }    /* they may be anybody's */
+  node.first = number;
+  return trb_reference(node, costs);
+}
+
+/* Such a leaf afterwards: it keeps what it holds. */
+TRB_CORE void trb_emit_old_leaf(const trb_collapser *c, trbvh_node leaf, trbvh_u32 number, trbvh_u32 dst) {
+  leaf.first = c->held[number].first;
+  leaf.count = c->held[number].count;
+  c->out[dst] = leaf;
 }
 
 /* A subtree of TRB_BLOCK references at most: what is known of it, what it came to, and its place in the result. A block
@@ -2418,7 +2440,7 @@ TRB_SHARED void trb_settle_task(const trb_collapser *c, TRB_GLOBAL trb_task *tas
       settled->count = count;
       prim += count;
       refs += trb_count(node.count);
-      sah += trb_sah_term(node, (TRB_REAL)c->cost_prim * count);
+      sah += trb_leaf_term(c, node, count);
       max_depth = TRB_MAX(v.depth, max_depth);
       if (waiting == 0) break;
       v = stack[--waiting];
@@ -2467,25 +2489,6 @@ TRB_SHARED void trb_emit_top(const trb_collapser *c, TRB_GLOBAL trb_task *tasks,
       dst = dsts[waiting];
     }
   }
-}
-
-/* The other way round: a node of a tree that is to be optimized. What a leaf holds goes aside, and the leaf becomes a
- * reference, known by its number; an inner node waits for trb_remake. */
-TRB_CORE trbvh_node trb_unsettle(trbvh_node node, trbvh_u32 number, TRB_GLOBAL trb_held *held, trb_costs costs) {
-  trbvh_u32 k;
-  held->first = node.first;
-  held->count = node.count;
-  if (node.count == 0) return node;
-  for (k = 0; k < 3; k++) { node.min[k] += TRB_PLUS_ZERO; node.max[k] += TRB_PLUS_ZERO; }    /* they may be anybody's */
-  node.first = number;
-  return trb_reference(node, costs);
-}
-
-/* Such a leaf afterwards: it keeps what it holds. */
-TRB_CORE void trb_emit_old_leaf(const trb_collapser *c, trbvh_node leaf, trbvh_u32 number, trbvh_u32 dst) {
-  leaf.first = c->held[number].first;
-  leaf.count = c->held[number].count;
-  c->out[dst] = leaf;
 }
 
 /* Writes one of a task's nodes. */
@@ -2791,7 +2794,7 @@ typedef struct trb_plan {
   trb_costs    costs;
   trb_key_form form;
   float        cost_node, cost_prim;
-  trbvh_u32    prim_count, position_count, index_size, boxes, split_max, ref_max;
+  trbvh_u32    prim_count, position_count, index_size, boxes, split_max, ref_max, optimizes;
   float        reinsert_share;
   /* found out */
   trb_grid     grid;
@@ -3955,29 +3958,29 @@ static double trb_exact_sah(const trb_build *b) {
 /* Into the tree's nodes and, unless they stay, its prims. */
 static trbvh_result trb_emit_nodes(trb_build *b) {
   const trb_collapser c = trb_start_collapse(b);
+  const float root = trb_area(b->nodes[0]);
+  double sah = b->sah;
   uint32_t i;
   memset(&c.out[1], 0, TRB_NODE_BYTES);
   trb_emit_top(&c, b->tasks, b->task_count);
   if (trb_run(&b->runner, b->group_count, trb_emit_job, b)) return TRBVH_CANCELLED;
-  for (i = 0; i < b->task_count; i++) b->stats.max_depth = TRB_MAX(b->tasks[i].max_depth, b->stats.max_depth);
+  for (i = 0; i < b->task_count; i++) {
+    sah += b->tasks[i].sah;
+    b->stats.max_depth = TRB_MAX(b->tasks[i].max_depth, b->stats.max_depth);
+  }
+  b->stats.sah_cost = trb_fits_areas(root) ? sah / root : trb_exact_sah(b);
   return TRBVH_OK;
 }
 
 static trbvh_result trb_emit(trb_build *b, trbvh *bvh) {
   uint32_t leaves = 0, prims = 0, i;
   trbvh_result result;
-  double sah = b->sah;
-  const float root = trb_area(b->nodes[0]);
   for (i = 0; i < b->task_count; i++) {
     leaves += b->tasks[i].leaves;
     prims += b->tasks[i].prims;
   }
   result = trb_make_room(b, bvh, leaves, prims);
-  if (!result) result = trb_emit_nodes(b);
-  if (result) return result;
-  for (i = 0; i < b->task_count; i++) sah += b->tasks[i].sah;
-  b->stats.sah_cost = trb_fits_areas(root) ? sah / root : trb_exact_sah(b);
-  return TRBVH_OK;
+  return result ? result : trb_emit_nodes(b);
 }
 
 // ---- Triangles ----
@@ -4176,8 +4179,8 @@ TRBVH_API trbvh_result trbvh_build(trbvh *bvh, const trbvh_geometry *geometry, c
 }
 
 // >>optimize ---- a tree that exists, whose leaves are the references ------------------------------------------------
-/* As a build of the leaves' boxes, none of which is to share a leaf with another. */
-static trbvh_result trb_resolve_optimize(trb_build *b, const trbvh *bvh, const trbvh_options *options) {
+/* As a build of the leaves' boxes, which stand among the nodes, none of them to share a leaf with another. */
+static trbvh_result trb_resolve_optimize(trb_build *b, const void *nodes, uint32_t node_count, const trbvh_options *options) {
   trbvh_geometry leaves;
   trbvh_options o;
   trbvh_result result;
@@ -4185,14 +4188,12 @@ static trbvh_result trb_resolve_optimize(trb_build *b, const trbvh *bvh, const t
   if (options) o = *options;
   o.max_leaf = 1;
   memset(&leaves, 0, sizeof leaves);
-  if (bvh) {
-    leaves.boxes = bvh->nodes;           /* they are not read as such */
-    leaves.count = bvh->nodes ? bvh->node_count / 2 : 0;
-  }
+  leaves.boxes = nodes;
+  leaves.count = nodes ? node_count / 2 : 0;
   result = trb_resolve(b, &leaves, &o);
   b->optimizes = 1;
   b->final = 0;
-  return bvh ? result : trb_fail(b, TRBVH_INVALID_ARGUMENT, "bvh is NULL", 0, 0, 0);
+  return result;
 }
 
 static trbvh_result trb_open_node(trb_build *b, const trbvh *bvh, uint32_t i) {
@@ -4243,7 +4244,8 @@ static trbvh_result trb_optimize(trb_build *b, trbvh *bvh) {
 TRBVH_API trbvh_result trbvh_optimize(trbvh *bvh, const trbvh_options *options) {
   trb_build b;
   const double start = trb_ms();
-  trbvh_result result = trb_resolve_optimize(&b, bvh, options);
+  trbvh_result result = trb_resolve_optimize(&b, bvh ? bvh->nodes : NULL, bvh ? bvh->node_count : 0, options);
+  if (!bvh) result = trb_fail(&b, TRBVH_INVALID_ARGUMENT, "bvh is NULL", 0, 0, 0);
   if (!result && b.input.count) {
     trb_runner_start(&b.runner, &b.options, b.input.count > TRB_BLOCK);
     result = trb_optimize(&b, bvh);
@@ -4254,7 +4256,6 @@ TRBVH_API trbvh_result trbvh_optimize(trbvh *bvh, const trbvh_options *options) 
     b.stats.node_count = bvh->node_count;
     b.stats.leaf_count = bvh->node_count / 2;
     b.stats.ref_count = bvh->ref_count;
-    b.stats.sah_cost = trb_exact_sah(&b);
   }
   if (result && !b.stats.message[0]) trb_fail(&b, result, trbvh_result_text(result), 0, 0, 0);
   b.stats.ms_total = trb_ms() - start;

@@ -93,9 +93,12 @@ typedef struct trbvh_cl_tree {
  * scratch memory grows. tree is {0}, or a tree of the same
  * device, whose buffers are freed.
  * refit: the mesh has moved, its topology has not. Boxes of a tree without splits become what build makes them; in one
- * with splits a leaf gets its whole triangles' boxes. The indices are not checked again. */
+ * with splits a leaf gets its whole triangles' boxes. The indices are not checked again.
+ * optimize: trbvh_optimize, and the same nodes, which get a new buffer. The tree must be a valid one. On failure it is as
+ * it was. Waits as build does. */
 TRBVH_API trbvh_result trbvh_cl_build    (trbvh_device *device, trbvh_cl_tree *tree, const trbvh_cl_geometry *geometry, const trbvh_options *options, struct _cl_event **done);
 TRBVH_API trbvh_result trbvh_cl_refit    (trbvh_device *device, trbvh_cl_tree *tree, const trbvh_cl_geometry *geometry, struct _cl_event **done);
+TRBVH_API trbvh_result trbvh_cl_optimize (trbvh_device *device, trbvh_cl_tree *tree, const trbvh_options *options, struct _cl_event **done);
 TRBVH_API trbvh_result trbvh_cl_intersect(trbvh_device *device, const trbvh_cl_tree *tree, struct _cl_mem *rays, struct _cl_mem *hits, size_t count, struct _cl_event **done);        /* trbvh_ray[], trbvh_hit[] */
 TRBVH_API trbvh_result trbvh_cl_occluded (trbvh_device *device, const trbvh_cl_tree *tree, struct _cl_mem *rays, struct _cl_mem *occluded, size_t count, struct _cl_event **done);    /* one byte a ray: 1 = occluded */
 TRBVH_API trbvh_result trbvh_cl_upload   (trbvh_device *device, trbvh_cl_tree *tree, const trbvh *bvh);                                         /* waits */
@@ -154,9 +157,9 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "typedef struct trbvh_hit { float t, u, v; trbvh_u32 prim; trbvh_u32 instance; } trbvh_hit;\n",
-  "#line 279 \"trbvh.h\"\n",
+  "#line 285 \"trbvh.h\"\n",
   "  #pragma OPENCL FP_CONTRACT OFF\n",
-  "#line 290 \"trbvh.h\"\n",
+  "#line 296 \"trbvh.h\"\n",
   "  #ifdef TRB_OUTLINE\n",
   "    #define TRB_CORE static inline __attribute__((unused))\n",
   "  #else\n",
@@ -175,11 +178,11 @@ static const char *const trb_cl_text[] = {
   "  #endif\n",
   "  #define trb_bits(x)  as_uint(x)\n",
   "  #define trb_float(x) as_float(x)\n",
-  "#line 330 \"trbvh.h\"\n",
+  "#line 336 \"trbvh.h\"\n",
   "#ifndef TRB_PREFETCH\n",
   "  #define TRB_PREFETCH(address) ((void)(address))\n",
   "#endif\n",
-  "#line 389 \"trbvh.h\"\n",
+  "#line 395 \"trbvh.h\"\n",
   "#ifndef TRBVH_ASSERT\n",
   "  #define TRBVH_ASSERT(x) ((void)0)\n",
   "#endif\n",
@@ -187,17 +190,17 @@ static const char *const trb_cl_text[] = {
   "\n",
   "    #define TRB_REAL float\n",
   "    #define TRB_NOISE 9.5367432e-7f\n",
-  "#line 400 \"trbvh.h\"\n",
+  "#line 406 \"trbvh.h\"\n",
   "#endif\n",
   "\n",
   "  #define TRB_ALIGNED(type) type __attribute__((aligned(64)))\n",
-  "#line 408 \"trbvh.h\"\n",
+  "#line 414 \"trbvh.h\"\n",
   "#if defined(__cplusplus) || defined(_MSC_VER)\n",
   "  #define TRB_RESTRICT __restrict\n",
   "#else\n",
   "  #define TRB_RESTRICT restrict\n",
   "#endif\n",
-  "#line 423 \"trbvh.h\"\n",
+  "#line 429 \"trbvh.h\"\n",
   "#define TRB_MIN(a, b) ((a) < (b) ? (a) : (b))\n",
   "#define TRB_MAX(a, b) ((a) > (b) ? (a) : (b))\n",
   "\n",
@@ -234,7 +237,7 @@ static const char *const trb_cl_text[] = {
   "  for (i = 0; i < 4; i++) r = r * (4.0f - x * r * r * r) * 0.333333343f;\n",
   "  return x * r * r;\n",
   "}\n",
-  "#line 469 \"trbvh.h\"\n",
+  "#line 475 \"trbvh.h\"\n",
   "#define TRB_MAX_LEAF 16u\n",
   "#define TRB_SMALL    0x80000000u\n",
   "#define TRB_LEAF     0x40000000u\n",
@@ -314,7 +317,7 @@ static const char *const trb_cl_text[] = {
   "  return trb_morton(0.5f * box.min[0] + 0.5f * box.max[0], 0.5f * box.min[1] + 0.5f * box.max[1],\n",
   "                    0.5f * box.min[2] + 0.5f * box.max[2], grid);\n",
   "}\n",
-  "#line 561 \"trbvh.h\"\n",
+  "#line 567 \"trbvh.h\"\n",
   "#define TRB_TREELET 7\n",
   "#define TRB_GPU_LANES 32u\n",
   "#if defined(TRB_GPU)\n",
@@ -361,7 +364,7 @@ static const char *const trb_cl_text[] = {
   "  1 << TRB_SKIP(1, without), 1 << TRB_SKIP(2, without), 1 << TRB_SKIP(3, without), 1 << TRB_SKIP(4, without), \\\n",
   "  1 << TRB_SKIP(5, without)))\n",
   "#define TRB_SKIP(i, without) ((i) + ((i) >= (without)))\n",
-  "#line 611 \"trbvh.h\"\n",
+  "#line 617 \"trbvh.h\"\n",
   "#define TRB_DEFINE_TREELET_COSTS(function) \\\n",
   "  function(const TRB_WORK float *TRB_RESTRICT leaves, TRB_WORK float *TRB_RESTRICT table, float *TRB_RESTRICT sums, \\\n",
   "           trb_costs costs) { \\\n",
@@ -437,7 +440,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "TRB_CORE int trb_improves(float cost, float old_cost) { return cost < old_cost - old_cost * 3.8147e-6f; }\n",
-  "#line 691 \"trbvh.h\"\n",
+  "#line 697 \"trbvh.h\"\n",
   "typedef struct trb_plane { int axis, level; float position; } trb_plane;\n",
   "#define TRB_TINY 1e-30f\n",
   "\n",
@@ -527,7 +530,7 @@ static const char *const trb_cl_text[] = {
   "    for (j = 0; j < 3; j++) polygon[i][j] = kept[i][j];\n",
   "  return count;\n",
   "}\n",
-  "#line 785 \"trbvh.h\"\n",
+  "#line 791 \"trbvh.h\"\n",
   "TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {\n",
   "  float polygon[TRB_POLYGON][3], pad[3];\n",
   "  trbvh_node bounds = *box;\n",
@@ -556,7 +559,7 @@ static const char *const trb_cl_text[] = {
   "  *box = bounds;\n",
   "  return 1;\n",
   "}\n",
-  "#line 817 \"trbvh.h\"\n",
+  "#line 823 \"trbvh.h\"\n",
   "  typedef struct trb_mesh {\n",
   "    const __global char *positions, *indices, *boxes;\n",
   "    ulong position_stride, box_stride;\n",
@@ -571,7 +574,7 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE float trb_load_float(const TRB_GLOBAL char *p) {\n",
   "\n",
   "  return *(const __global float *)p;\n",
-  "#line 839 \"trbvh.h\"\n",
+  "#line 845 \"trbvh.h\"\n",
   "}\n",
   "\n",
   "TRB_CORE void trb_load_position(float out[3], const TRB_GLOBAL char *p) {\n",
@@ -583,13 +586,13 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE trbvh_u32 trb_index16(const trb_mesh *mesh, size_t i) {\n",
   "\n",
   "  return ((const __global ushort *)mesh->indices)[i];\n",
-  "#line 855 \"trbvh.h\"\n",
+  "#line 861 \"trbvh.h\"\n",
   "}\n",
   "\n",
   "TRB_CORE trbvh_u32 trb_index32(const trb_mesh *mesh, size_t i) {\n",
   "\n",
   "  return ((const __global uint *)mesh->indices)[i];\n",
-  "#line 865 \"trbvh.h\"\n",
+  "#line 871 \"trbvh.h\"\n",
   "}\n",
   "\n",
   "TRB_CORE trbvh_u32 trb_index(const trb_mesh *mesh, size_t i) {\n",
@@ -801,7 +804,7 @@ static const char *const trb_cl_text[] = {
   "  grid.cells_per_unit = extent > 1e-30f && extent < FLT_MAX ? trb_reciprocal(grid.units_per_cell) : 0;\n",
   "  return grid;\n",
   "}\n",
-  "#line 1082 \"trbvh.h\"\n",
+  "#line 1088 \"trbvh.h\"\n",
   "#define TRB_SCALE_BITS  36\n",
   "#define TRB_SCALES      2561u\n",
   "#define TRB_SPLIT_STACK 64u\n",
@@ -859,7 +862,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "  return count;\n",
   "}\n",
-  "#line 1145 \"trbvh.h\"\n",
+  "#line 1151 \"trbvh.h\"\n",
   "#ifndef TRB_PACKED_REFS\n",
   "  #define TRB_PACKED_REFS (1u << 24)\n",
   "#endif\n",
@@ -919,7 +922,7 @@ static const char *const trb_cl_text[] = {
   "      start += n;\n",
   "    }\n",
   "}\n",
-  "#line 1212 \"trbvh.h\"\n",
+  "#line 1218 \"trbvh.h\"\n",
   "#define TRB_BLOCK    16384u\n",
   "#define TRB_TOP      1024u\n",
   "#define TRB_NEAR     98304u\n",
@@ -941,7 +944,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "TRB_CORE trbvh_node trb_curve_ref(const trb_curve *c, trb_u64 key) {\n",
   "  const trbvh_u32 ref = trb_key_ref(key, c->form);\n",
-  "#line 1243 \"trbvh.h\"\n",
+  "#line 1249 \"trbvh.h\"\n",
   "  return c->refs[ref];\n",
   "}\n",
   "\n",
@@ -949,7 +952,7 @@ static const char *const trb_cl_text[] = {
   "TRB_SHARED void trb_read_leaves(const trb_curve *c, trbvh_u32 first, trbvh_u32 count, trbvh_u32 end, trb_row *row) {\n",
   "  const trbvh_u32 next = first + count, soon = TRB_MIN(next + TRB_ROW, end);\n",
   "  trbvh_u32 i, k;\n",
-  "#line 1260 \"trbvh.h\"\n",
+  "#line 1266 \"trbvh.h\"\n",
   "  for (i = next; i < soon; i++) TRB_PREFETCH(&c->refs[trb_key_ref(c->keys[i], c->form)]);\n",
   "  for (i = 0; i < count; i++) {\n",
   "    const trbvh_node ref = c->refs[trb_key_ref(c->keys[first + i], c->form)];\n",
@@ -968,7 +971,7 @@ static const char *const trb_cl_text[] = {
   "  code = trb_box_code(trb_curve_ref(c, a), c->grid) ^ trb_box_code(trb_curve_ref(c, b), c->grid);\n",
   "  return code ? code | (trb_u64)1 << 63 : (trbvh_u32)(a ^ b);\n",
   "}\n",
-  "#line 1282 \"trbvh.h\"\n",
+  "#line 1288 \"trbvh.h\"\n",
   "typedef struct trb_open {\n",
   "  trbvh_node node;\n",
   "  trb_u64    split;\n",
@@ -985,7 +988,7 @@ static const char *const trb_cl_text[] = {
   "  trbvh_u32  end, pairs;\n",
   "  struct { trb_u64 split; trbvh_u32 pair, prim, first_pair; } stack[TRB_OPEN_MAX];\n",
   "} trb_forest;\n",
-  "#line 1302 \"trbvh.h\"\n",
+  "#line 1308 \"trbvh.h\"\n",
   "#define TRB_TO_RESTRUCTURE 0\n",
   "#define TRB_FINAL_BLOCK    1\n",
   "#define TRB_FINAL_TOP      2\n",
@@ -1089,7 +1092,7 @@ static const char *const trb_cl_text[] = {
   "    }\n",
   "  TRBVH_ASSERT(f.height == 1);\n",
   "}\n",
-  "#line 1409 \"trbvh.h\"\n",
+  "#line 1415 \"trbvh.h\"\n",
   "#define TRB_LANE_LOAD(p)     (*(p))\n",
   "#define TRB_LANE_STORE(p, x) (*(p) = (x))\n",
   "#define TRB_LANE_OF(x)       (x)\n",
@@ -1207,7 +1210,7 @@ static const char *const trb_cl_text[] = {
   "  for (lane = 0; lane < lanes; lane++) trb_treelet_costs_1(leaves + lane, table + lane, sums + lane, costs);\n",
   "}\n",
   "#endif\n",
-  "#line 1540 \"trbvh.h\"\n",
+  "#line 1546 \"trbvh.h\"\n",
   "typedef struct trb_treelets {\n",
   "  float     leaves[TRB_TREELET * TRB_LEAF_VALUES * TRB_LANES];\n",
   "  float     table[TRB_SUBSETS * TRB_LANES + 16];\n",
@@ -1383,7 +1386,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "}\n",
   "#endif\n",
-  "#line 1724 \"trbvh.h\"\n",
+  "#line 1730 \"trbvh.h\"\n",
   "typedef struct trb_move {\n",
   "  trbvh_u32 node, target;\n",
   "  trbvh_u32 above;\n",
@@ -1544,7 +1547,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "}\n",
   "#endif\n",
-  "#line 1892 \"trbvh.h\"\n",
+  "#line 1898 \"trbvh.h\"\n",
   "#define TRB_MOVE_BATCHES 4u\n",
   "#define TRB_SCORES       2048u\n",
   "#define TRB_SCORE_SHIFT  20\n",
@@ -1582,7 +1585,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "TRB_CORE float trb_least_gain(trbvh_u32 lowest) { return trb_float(lowest << TRB_SCORE_SHIFT) * 0.0625f; }\n",
-  "#line 1934 \"trbvh.h\"\n",
+  "#line 1940 \"trbvh.h\"\n",
   "TRB_SHARED trb_move trb_find_place(const trb_mover *m, trbvh_u32 node, float least) {\n",
   "  const trbvh_node n = m->nodes[node];\n",
   "  const float area = trb_area(n);\n",
@@ -1695,7 +1698,7 @@ static const char *const trb_cl_text[] = {
   "        m->moves[at++].gain = 0;\n",
   "      }\n",
   "}\n",
-  "#line 2055 \"trbvh.h\"\n",
+  "#line 2061 \"trbvh.h\"\n",
   "#define TRB_UNSPLIT_BIAS 2.0f\n",
   "\n",
   "\n",
@@ -1790,7 +1793,7 @@ static const char *const trb_cl_text[] = {
   "  if (move->target == (move->node ^ 1u)) move->target = parent;\n",
   "  move->above = parent;\n",
   "}\n",
-  "#line 2155 \"trbvh.h\"\n",
+  "#line 2161 \"trbvh.h\"\n",
   "#define TRB_SPLITS_PAY 0.98\n",
   "\n",
   "\n",
@@ -1812,7 +1815,9 @@ static const char *const trb_cl_text[] = {
   "  if (trb_is_leaf(right.count)) cost += trb_round_cost(weight * trb_area(right) * (float)trb_count(right.count));\n",
   "  return cost;\n",
   "}\n",
-  "#line 2191 \"trbvh.h\"\n",
+  "#line 2197 \"trbvh.h\"\n",
+  "typedef struct trb_held { trbvh_u32 first, count; } trb_held;\n",
+  "\n",
   "typedef struct trb_collapser {\n",
   "  TRB_GLOBAL trbvh_node *nodes;\n",
   "  trb_words words;\n",
@@ -1822,6 +1827,7 @@ static const char *const trb_cl_text[] = {
   "  const TRB_GLOBAL trb_u64 *keys;\n",
   "  trb_key_form form;\n",
   "  trbvh_u32    ref_count;\n",
+  "  const TRB_GLOBAL trb_held *held;\n",
   "  TRB_GLOBAL trbvh_node *out;\n",
   "  TRB_GLOBAL trbvh_u32  *prims;\n",
   "} trb_collapser;\n",
@@ -1908,12 +1914,34 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "TRB_CORE TRB_REAL trb_sah_term(trbvh_node node, TRB_REAL weight) { return weight * trb_area(node); }\n",
+  "TRB_CORE TRB_REAL trb_leaf_term(const trb_collapser *c, trbvh_node leaf, trbvh_u32 prims) {\n",
+  "  return trb_sah_term(leaf, (TRB_REAL)c->cost_prim * (c->held ? c->held[leaf.first].count : prims));\n",
+  "}\n",
   "\n",
   "\n",
   "TRB_CORE void trb_emit_inner(const trb_collapser *c, trbvh_node node, trbvh_u32 dst, trbvh_u32 pair) {\n",
   "  node.first = 2 * pair;\n",
   "  node.count = 0;\n",
   "  c->out[dst] = node;\n",
+  "}\n",
+  "\n",
+  "\n",
+  "\n",
+  "TRB_CORE trbvh_node trb_unsettle(trbvh_node node, trbvh_u32 number, TRB_GLOBAL trb_held *held, trb_costs costs) {\n",
+  "  trbvh_u32 k;\n",
+  "  held->first = node.first;\n",
+  "  held->count = node.count;\n",
+  "  if (node.count == 0) return node;\n",
+  "  for (k = 0; k < 3; k++) { node.min[k] += TRB_PLUS_ZERO; node.max[k] += TRB_PLUS_ZERO; }\n",
+  "  node.first = number;\n",
+  "  return trb_reference(node, costs);\n",
+  "}\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_emit_old_leaf(const trb_collapser *c, trbvh_node leaf, trbvh_u32 number, trbvh_u32 dst) {\n",
+  "  leaf.first = c->held[number].first;\n",
+  "  leaf.count = c->held[number].count;\n",
+  "  c->out[dst] = leaf;\n",
   "}\n",
   "\n",
   "\n",
@@ -2010,7 +2038,7 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE void trb_prefetch_pairs(const trb_collapser *c, trbvh_u32 ref, trbvh_u32 count) {\n",
   "  for (; count-- && ref > 2 * TRB_AHEAD; ref--) TRB_PREFETCH(&c->nodes[2 * (ref - 2 * TRB_AHEAD)]);\n",
   "}\n",
-  "#line 2392 \"trbvh.h\"\n",
+  "#line 2423 \"trbvh.h\"\n",
   "TRB_SHARED void trb_settle_task(const trb_collapser *c, TRB_GLOBAL trb_task *task) {\n",
   "  TRB_GLOBAL trbvh_u32 *order = c->words.plane[0] + task->first_ref, *prims = c->words.plane[1] + task->first_ref;\n",
   "  trbvh_u32 waiting = 0, pairs = 0, refs = task->first_ref, prim = 0, max_depth = 0, i;\n",
@@ -2031,7 +2059,7 @@ static const char *const trb_cl_text[] = {
   "      settled->count = count;\n",
   "      prim += count;\n",
   "      refs += trb_count(node.count);\n",
-  "      sah += trb_sah_term(node, (TRB_REAL)c->cost_prim * count);\n",
+  "      sah += trb_leaf_term(c, node, count);\n",
   "      max_depth = TRB_MAX(v.depth, max_depth);\n",
   "      if (waiting == 0) break;\n",
   "      v = stack[--waiting];\n",
@@ -2085,6 +2113,10 @@ static const char *const trb_cl_text[] = {
   "\n",
   "TRB_CORE void trb_emit_settled(const trb_collapser *c, const trb_task *task, trbvh_u32 src, trbvh_u32 dst) {\n",
   "  trbvh_node node = c->nodes[src];\n",
+  "  if (c->held && node.count) {\n",
+  "    trb_emit_old_leaf(c, node, c->words.plane[1][task->first_ref + node.first], dst);\n",
+  "    return;\n",
+  "  }\n",
   "  node.first = node.count ? task->first_prim + node.first : 2 * (task->pair + node.first);\n",
   "  c->out[dst] = node;\n",
   "}\n",
@@ -2099,7 +2131,7 @@ static const char *const trb_cl_text[] = {
   "    trb_emit_settled(c, &task, order[i], 2 * (task.pair + i));\n",
   "    trb_emit_settled(c, &task, order[i] + 1, 2 * (task.pair + i) + 1);\n",
   "  }\n",
-  "  for (i = 0; i < task.prims; i++) c->prims[task.first_prim + i] = prims[i];\n",
+  "  for (i = 0; i < task.prims && !c->held; i++) c->prims[task.first_prim + i] = prims[i];\n",
   "}\n",
   "\n",
   "\n",
@@ -2178,7 +2210,7 @@ static const char *const trb_cl_text[] = {
   "    default: trb_make_form(mesh, 4, prims, first, end, out); break;\n",
   "  }\n",
   "}\n",
-  "#line 2570 \"trbvh.h\"\n",
+  "#line 2605 \"trbvh.h\"\n",
   "#define TRB_UNIT 5.9604645e-8f\n",
   "#define TRB_ABS(x) ((x) < 0 ? -(x) : (x))\n",
   "typedef struct trb_ray {\n",
@@ -2256,7 +2288,7 @@ static const char *const trb_cl_text[] = {
   "  along = TRB_MIN(along, 1);\n",
   "  return TRB_MAX(along, 0);\n",
   "}\n",
-  "#line 2654 \"trbvh.h\"\n",
+  "#line 2689 \"trbvh.h\"\n",
   "TRB_CORE int trb_hit_triangle(const TRB_GLOBAL trbvh_triangle *t, const trb_ray *r, float tmax, trbvh_hit *hit) {\n",
   "  const int x = r->axis[0], y = r->axis[1], z = r->axis[2];\n",
   "  const trb_corner a = trb_see(t->v0[x], t->v0[y], t->v0[z], r);\n",
@@ -2297,7 +2329,7 @@ static const char *const trb_cl_text[] = {
   "  hit->u = hit->v = 0;\n",
   "  hit->prim = hit->instance = TRBVH_NONE;\n",
   "}\n",
-  "#line 2698 \"trbvh.h\"\n",
+  "#line 2733 \"trbvh.h\"\n",
   "TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbvh_triangle *triangles,\n",
   "                       const trb_ray *r, int any, trbvh_hit *hit) {\n",
   "  trbvh_u32 stack_node[TRBVH_MAX_DEPTH], height = 0, node = 0, i;\n",
@@ -2362,7 +2394,7 @@ static const char *const trb_cl_text[] = {
   "  trb_costs    costs;\n",
   "  trb_key_form form;\n",
   "  float        cost_node, cost_prim;\n",
-  "  trbvh_u32    prim_count, position_count, index_size, boxes, split_max, ref_max;\n",
+  "  trbvh_u32    prim_count, position_count, index_size, boxes, split_max, ref_max, optimizes;\n",
   "  float        reinsert_share;\n",
   "\n",
   "  trb_grid     grid;\n",
@@ -2507,6 +2539,7 @@ static const char *const trb_cl_text[] = {
   "  c.cost_node = plan->cost_node;\n",
   "  c.cost_prim = plan->cost_prim;\n",
   "  c.refs = plan->split_max ? refs : 0;\n",
+  "  c.held = plan->optimizes ? (const __global trb_held *)refs : 0;\n",
   "  c.out = 0;\n",
   "  c.prims = 0;\n",
   "  return c;\n",
@@ -2521,7 +2554,7 @@ static const char *const trb_cl_text[] = {
   "  c.prims = prims;\n",
   "  return c;\n",
   "}\n",
-  "#line 121 \"kernels/shape.cl\"\n",
+  "#line 122 \"kernels/shape.cl\"\n",
   "static uint trb_reserve(volatile __global uint *end, uint count, __local uint *space) {\n",
   "#ifdef TRB_CPU\n",
   "  return count ? atomic_add(end, count) : 0;\n",
@@ -3483,10 +3516,10 @@ static const char *const trb_cl_text[] = {
   "  trb_emit_top(&c, tasks, plan->tasks);\n",
   "}\n",
   "\n",
-  "TRB_KERNEL trb_k_emit_tasks(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,\n",
-  "                            __global ulong *sorted, const __global trb_task *tasks, __global trbvh_node *out,\n",
-  "                            __global uint *prims) {\n",
-  "  const trb_collapser c = trb_plan_emitter(plan, nodes, 0, keys, sorted, out, prims);\n",
+  "TRB_KERNEL trb_k_emit_tasks(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trbvh_node *refs,\n",
+  "                            __global ulong *keys, __global ulong *sorted, const __global trb_task *tasks,\n",
+  "                            __global trbvh_node *out, __global uint *prims) {\n",
+  "  const trb_collapser c = trb_plan_emitter(plan, nodes, refs, keys, sorted, out, prims);\n",
   "  uint i;\n",
   "  TRB_FOR_JOBS(i, plan->tasks) trb_emit_task(&c, tasks[i]);\n",
   "}\n",
@@ -3500,6 +3533,10 @@ static const char *const trb_cl_text[] = {
   "\n",
   "TRB_CORE uint trb_emit_leaf(const trb_collapser *c, trbvh_node node, uint dst, uint first) {\n",
   "  uint prims[TRB_MAX_LEAF], i;\n",
+  "  if (c->held) {\n",
+  "    trb_emit_old_leaf(c, node, node.first, dst);\n",
+  "    return 1;\n",
+  "  }\n",
   "  node.count = trb_leaf_prims(c, node, prims);\n",
   "  node.first = first;\n",
   "  c->out[dst] = node;\n",
@@ -3574,7 +3611,7 @@ static const char *const trb_cl_text[] = {
   "    if (trb_is_leaf(child.count)) {\n",
   "      const uint count = trb_count_prims(c, child);\n",
   "      sum.prims += count;\n",
-  "      sum.sah += trb_sah_term(child, c->cost_prim * count);\n",
+  "      sum.sah += trb_leaf_term(c, child, count);\n",
   "    } else {\n",
   "      const trb_place below = places[child.first / 2];\n",
   "      sum.inner += below.inner;\n",
@@ -3620,7 +3657,7 @@ static const char *const trb_cl_text[] = {
   "  if (trb_is_leaf(nodes[0].count)) {\n",
   "    plan->leaves = 1;\n",
   "    plan->prims = trb_count_prims(&c, nodes[0]);\n",
-  "    plan->sah = trb_sah_term(nodes[0], c.cost_prim * plan->prims);\n",
+  "    plan->sah = trb_leaf_term(&c, nodes[0], plan->prims);\n",
   "  } else {\n",
   "    __global trb_place *root = &places[nodes[0].first / 2];\n",
   "    while (levels[depth].count) depth++;\n",
@@ -3688,7 +3725,7 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "#endif\n",
   "#ifdef TRB_WITH_REFIT\n",
-  "#line 5 \"kernels/refit.cl\"\n",
+  "#line 6 \"kernels/refit.cl\"\n",
   "TRB_KERNEL trb_k_first_refit(const __global trbvh_node *nodes, __global trb_level *levels, __global uint *list) {\n",
   "  uint i;\n",
   "  for (i = TRB_LOCAL_ID; i < TRB_GPU_LEVELS; i += TRB_GROUP) levels[i].first = levels[i].count = 0;\n",
@@ -3751,6 +3788,25 @@ static const char *const trb_cl_text[] = {
   "    }\n",
   "  }\n",
   "}\n",
+  "\n",
+  "\n",
+  "TRB_KERNEL trb_k_unsettle(const __global trb_plan *plan, const __global trbvh_node *old, __global trbvh_node *nodes,\n",
+  "                          __global trb_held *held, uint count) {\n",
+  "  const trb_costs costs = plan->costs;\n",
+  "  uint i;\n",
+  "  TRB_FOR(i, count) nodes[i] = trb_unsettle(old[i], i, &held[i], costs);\n",
+  "}\n",
+  "\n",
+  "TRB_KERNEL trb_k_unsettle_level(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,\n",
+  "                                const __global uint *list, uint level) {\n",
+  "  const uint first = levels[level].first, count = levels[level].count;\n",
+  "  const trb_costs costs = plan->costs;\n",
+  "  uint i;\n",
+  "  for (i = (uint)get_global_id(0); i < count; i += (uint)get_global_size(0)) {\n",
+  "    const uint node = list[first + i], pair = nodes[node].first;\n",
+  "    nodes[node] = trb_parent(nodes[pair], nodes[pair + 1], pair, costs);\n",
+  "  }\n",
+  "}\n",
   "#endif\n",
   "#ifdef TRB_WITH_TRACE\n",
   "#line 5 \"kernels/trace.cl\"\n",
@@ -3787,9 +3843,9 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "#endif\n",
 };
-#define TRB_CL_CORE_LINES 2295u   /* entries of trb_cl_text for user kernels: types, core, traversal */
-#define TRB_CL_LINES      3668u   /* all entries */
-#define TRB_CL_HASH       "0a441244af6a66e7"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_CORE_LINES 2324u   /* entries of trb_cl_text for user kernels: types, core, traversal */
+#define TRB_CL_LINES      3721u   /* all entries */
+#define TRB_CL_HASH       "608806f68b82fe1a"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
@@ -3820,6 +3876,11 @@ TRBVH_API trbvh_result trbvh_cl_build(trbvh_device *device, trbvh_cl_tree *tree,
 TRBVH_API trbvh_result trbvh_cl_refit(trbvh_device *device, trbvh_cl_tree *tree, const trbvh_cl_geometry *geometry,
                                       struct _cl_event **done) {
   (void)device; (void)tree; (void)geometry; (void)done;
+  return TRBVH_NO_DEVICE;
+}
+TRBVH_API trbvh_result trbvh_cl_optimize(trbvh_device *device, trbvh_cl_tree *tree, const trbvh_options *options,
+                                         struct _cl_event **done) {
+  (void)device; (void)tree; (void)options; (void)done;
   return TRBVH_NO_DEVICE;
 }
 TRBVH_API trbvh_result trbvh_cl_intersect(trbvh_device *device, const trbvh_cl_tree *tree, struct _cl_mem *rays,
@@ -4026,13 +4087,14 @@ static int trb_cl_load(trb_cl_api *api, trbvh_stats *stats) {
   X(MOVES, remake_level, "bbbbu")     X(MOVES, remake_levels, "bbbbu")    X(MOVES, sum_costs, "bbb") \
   X(MOVES, add_costs, "bbu") \
   X(BUILD, find_tasks, "bbbbbb")      X(BUILD, settle_groups, "bbbbbbb")  X(BUILD, sum_tasks, "bb") \
-  X(BUILD, emit_top, "bbbbbbb")       X(BUILD, emit_tasks, "bbbbbbb") \
+  X(BUILD, emit_top, "bbbbbbb")       X(BUILD, emit_tasks, "bbbbbbbb") \
   X(BUILD, first_inner, "bbbbb")      X(BUILD, list_inner, "bbbbbbbu")    X(BUILD, list_rest, "bbbbbbbu") \
   X(BUILD, count_inner, "bbbbbbu")    X(BUILD, count_rest, "bbbbbbu")     X(BUILD, sum_inner, "bbbbb") \
   X(BUILD, emit_root, "bbbbb")        X(BUILD, emit_level, "bbbbbbbbu") \
   X(BUILD, triangles, "bbbbbu")       X(REFIT, triangles, "bbbbbu") \
   X(REFIT, first_refit, "bbb")        X(REFIT, list_refit, "bbbu") \
   X(REFIT, refit_leaves, "bbbbbu")    X(REFIT, refit_level, "bbbu") \
+  X(REFIT, unsettle, "bbbbu")         X(REFIT, unsettle_level, "bbbbu") \
   X(TRACE, intersect, "bbbbull")      X(TRACE, occluded, "bbbbull")
 
 enum {
@@ -4700,6 +4762,7 @@ static void trb_cl_send_plan(trb_cl_work *w) {
   p->boxes = b->input.boxes != NULL;
   p->split_max = b->splitting ? b->split_max : 0;
   p->ref_max = b->ref_max;
+  p->optimizes = (uint32_t)b->optimizes;
   p->reinsert_share = b->options.reinsert_share;
   p->index_size = b->input.indices ? b->input.index_size : 0;
   p->position_count = b->input.position_count;
@@ -4988,7 +5051,7 @@ static void trb_cl_emit_tree(trb_cl_work *w) {
   uint32_t level;
   if (cl->cpu) {
     trb_cl_launch(cl, TRB_CL_BUILD_emit_top, 1, w->state, w->nodes, w->keys, w->sorted, w->tasks, w->out_nodes, w->out_prims);
-    trb_cl_launch(cl, TRB_CL_BUILD_emit_tasks, w->plan.tasks * TRB_JOB_STEP, w->state, w->nodes, w->keys, w->sorted, w->tasks,
+    trb_cl_launch(cl, TRB_CL_BUILD_emit_tasks, w->plan.tasks * TRB_JOB_STEP, w->state, w->nodes, w->refs, w->keys, w->sorted, w->tasks,
                   w->out_nodes, w->out_prims);
     return;
   }
@@ -5053,16 +5116,12 @@ static trbvh_result trb_cl_attempt(void *worker, int splitting, double *cost) {
   return result;
 }
 
-/* Everything up to the size of the result; then w->plan has the counts. */
-static trbvh_result trb_cl_run_to_counts(trb_cl_work *w) {
+/* The last phase, and the size of the result: then w->plan has the counts. */
+static trbvh_result trb_cl_run_last(trb_cl_work *w) {
   const trb_build *b = w->b;
   const trb_plan *p = &w->plan;
-  trbvh_result result;
-  double start;
-  trb_cl_make_buffers(w);
-  result = trb_attempt_both(w->b, trb_cl_attempt, w);
-  if (!result) result = trb_cl_run_phase(w, trb_phases(b) - 1);
-  start = trb_ms();
+  trbvh_result result = trb_cl_run_phase(w, trb_phases(b) - 1);
+  double start = trb_ms();
   TRB_CL_STAGE(0.1f, ms_collapse, (trb_cl_count_tree(w), trb_cl_read(w->cl, w->state, &w->plan, sizeof w->plan)))
   if (result) return result;
   if (p->too_deep) return trb_cl_too_deep(w);
@@ -5078,6 +5137,13 @@ static trbvh_result trb_cl_run_to_counts(trb_cl_work *w) {
   w->b->stats.max_depth = p->max_depth;
   w->b->stats.sah_cost = p->root_area > 0 ? (double)p->sah / (double)p->root_area : 0;
   return TRBVH_OK;
+}
+
+static trbvh_result trb_cl_run_to_counts(trb_cl_work *w) {
+  trbvh_result result;
+  trb_cl_make_buffers(w);
+  result = trb_attempt_both(w->b, trb_cl_attempt, w);
+  return result ? result : trb_cl_run_last(w);
 }
 
 static trbvh_result trb_cl_run_to_end(trb_cl_work *w) {
@@ -5324,6 +5390,20 @@ TRBVH_API trbvh_result trbvh_cl_build(trbvh_device *device, trbvh_cl_tree *tree,
   return result;
 }
 
+static uint32_t trb_cl_tree_groups(const trbvh_cl_tree *tree, uint32_t level) {
+  return TRB_MIN(trb_cl_level_groups(level, tree->node_count / 2, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX);
+}
+
+/* Lists the inner nodes of a tree by level. */
+static void trb_cl_list_tree(trb_cl_work *w, const trbvh_cl_tree *tree) {
+  uint32_t level;
+  w->lists = trb_cl_scratch(w->cl, TRB_CL_SCRATCH_lists, (size_t)tree->node_count / 2 * 4);
+  w->levels = trb_cl_scratch(w->cl, TRB_CL_SCRATCH_levels, TRB_GPU_LEVELS * sizeof(trb_level));
+  trb_cl_launch(w->cl, TRB_CL_REFIT_first_refit, 1, tree->nodes, w->levels, w->lists);
+  for (level = 0; level < TRBVH_MAX_DEPTH; level++)
+    trb_cl_launch(w->cl, TRB_CL_REFIT_list_refit, trb_cl_tree_groups(tree, level), tree->nodes, w->levels, w->lists, level);
+}
+
 TRBVH_API trbvh_result trbvh_cl_refit(trbvh_device *device, trbvh_cl_tree *tree, const trbvh_cl_geometry *geometry,
                                       struct _cl_event **done) {
   trb_build b;
@@ -5341,26 +5421,100 @@ TRBVH_API trbvh_result trbvh_cl_refit(trbvh_device *device, trbvh_cl_tree *tree,
   if (!tree || tree->prim_count != b.input.count)
     return trb_cl_refuse(cl, tree ? "the tree has another number of triangles than the geometry" : "tree is NULL");
   if (tree->node_count) {
-    const uint32_t pairs = tree->node_count / 2;
-    w->lists = trb_cl_scratch(cl, TRB_CL_SCRATCH_lists, (size_t)pairs * 4);
-    w->levels = trb_cl_scratch(cl, TRB_CL_SCRATCH_levels, TRB_GPU_LEVELS * sizeof(trb_level));
     trb_cl_send_plan(w);
     if (tree->triangles)
       trb_cl_launch(cl, TRB_CL_REFIT_triangles, trb_cl_spread(cl, tree->ref_count), w->state, w->positions, w->indices,
                     tree->prims, tree->triangles, tree->ref_count);
     trb_cl_launch(cl, TRB_CL_REFIT_refit_leaves, trb_cl_spread(cl, tree->node_count), w->state, w->positions, w->indices,
                   tree->prims, tree->nodes, tree->node_count);
-    trb_cl_launch(cl, TRB_CL_REFIT_first_refit, 1, tree->nodes, w->levels, w->lists);
-    for (level = 0; level < TRBVH_MAX_DEPTH; level++)
-      trb_cl_launch(cl, TRB_CL_REFIT_list_refit, TRB_MIN(trb_cl_level_groups(level, pairs, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX),
-                    tree->nodes, w->levels, w->lists, level);
+    trb_cl_list_tree(w, tree);
     for (level = TRBVH_MAX_DEPTH; level-- > 0;)
-      trb_cl_launch(cl, TRB_CL_REFIT_refit_level, TRB_MIN(trb_cl_level_groups(level, pairs, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX),
-                    tree->nodes, w->levels, w->lists, level);
+      trb_cl_launch(cl, TRB_CL_REFIT_refit_level, trb_cl_tree_groups(tree, level), tree->nodes, w->levels, w->lists, level);
     trb_cl_free_input(w);
   }
   trb_cl_mark(cl, done);
   return trb_cl_result(cl, NULL);
+}
+
+static trbvh_result trb_cl_open_tree(trb_cl_work *w, const trbvh_cl_tree *tree) {
+  trbvh_result result = TRBVH_OK;
+  uint32_t level = TRBVH_MAX_DEPTH;
+  double start = trb_ms();
+  trb_start_attempt(w->b, 0);
+  w->b->effort = 1;
+  w->plan.ref_count = w->plan.slots = w->b->input.count;
+  w->plan.bad = TRBVH_NONE;
+  trb_cl_send_plan(w);
+  trb_cl_launch(w->cl, TRB_CL_REFIT_unsettle, trb_cl_spread(w->cl, tree->node_count), w->state, tree->nodes, w->nodes, w->refs,
+                tree->node_count);
+  trb_cl_list_tree(w, tree);
+  while (level-- > 0)
+    trb_cl_launch(w->cl, TRB_CL_REFIT_unsettle_level, trb_cl_tree_groups(tree, level), w->state, w->nodes, w->levels, w->lists,
+                  level);
+  TRB_CL_STAGE(0.1f, ms_hierarchy, (void)0)
+  return result;
+}
+
+static trbvh_result trb_cl_run_optimize(trb_cl_work *w, trbvh_cl_tree *tree) {
+  trbvh_result result;
+  uint32_t phase;
+  double start;
+  trb_cl_make_buffers(w);
+  result = trb_cl_open_tree(w, tree);
+  for (phase = 0; !result && phase + 1 < trb_phases(w->b); phase++) result = trb_cl_run_phase(w, phase);
+  if (!result) result = trb_cl_run_last(w);
+  if (!result && w->plan.leaves != tree->node_count / 2)
+    result = trb_fail(w->b, TRBVH_DEVICE_ERROR, "the device miscalculates: %u leaves of %u", w->plan.leaves, tree->node_count / 2, 0);
+  if (result) return result;
+  w->out_nodes = trb_cl_buffer(w->cl, TRB_CL_MEM_READ_WRITE, (size_t)tree->node_count * sizeof(trbvh_node), NULL);
+  start = trb_ms();
+  TRB_CL_STAGE(0, ms_collapse, trb_cl_emit_tree(w))
+  return result;
+}
+
+TRBVH_API trbvh_result trbvh_cl_optimize(trbvh_device *device, trbvh_cl_tree *tree, const trbvh_options *options,
+                                         struct _cl_event **done) {
+  trb_build b;
+  trb_cl_work work, *w = &work;
+  double start = trb_ms();
+  trbvh_result result;
+  memset(w, 0, sizeof *w);
+  w->cl = (trb_cl *)device;
+  w->b = &b;
+  if (done) *done = NULL;
+  result = trb_resolve_optimize(&b, tree ? tree->nodes : NULL, tree ? tree->node_count : 0, options);
+  if (!device) result = trb_fail(&b, TRBVH_NO_DEVICE, "device is NULL", 0, 0, 0);
+  else if (!tree) result = trb_fail(&b, TRBVH_INVALID_ARGUMENT, "tree is NULL", 0, 0, 0);
+  if (device) trb_cl_begin(w->cl);
+  if (!result && b.input.count) {
+    trb_runner_start(&b.runner, &b.options, 0);
+    result = trb_cl_run_optimize(w, tree);
+    trb_runner_stop(&b.runner);
+  }
+  if (!result) {
+    trb_cl_mark(w->cl, done);
+    result = trb_cl_result(w->cl, &b.stats);
+  }
+  if (!result && w->out_nodes) {
+    trb_cl_release(w->cl, &tree->nodes);
+    tree->nodes = w->out_nodes;
+    w->out_nodes = NULL;
+  }
+  if (device) {
+    trb_cl_free_output(w);
+    trb_cl_free_input(w);
+  }
+  if (!result) {
+    b.stats.node_count = tree->node_count;
+    b.stats.leaf_count = tree->node_count / 2;
+    b.stats.ref_count = tree->ref_count;
+  }
+  if (result && !b.stats.message[0]) trb_fail(&b, result, trbvh_result_text(result), 0, 0, 0);
+  if (result && device) trb_cl_refuse(w->cl, b.stats.message);
+  b.stats.on_device = result == TRBVH_OK;
+  b.stats.ms_total = trb_ms() - start;
+  if (options && options->stats) *options->stats = b.stats;
+  return result;
 }
 
 static trbvh_result trb_cl_query(trbvh_device *device, int kernel, const trbvh_cl_tree *tree, trb_cl_mem rays, trb_cl_mem out,

@@ -51,10 +51,10 @@ TRB_KERNEL trb_k_emit_top(const __global trb_plan *plan, __global trbvh_node *no
   trb_emit_top(&c, tasks, plan->tasks);
 }
 
-TRB_KERNEL trb_k_emit_tasks(const __global trb_plan *plan, __global trbvh_node *nodes, __global ulong *keys,
-                            __global ulong *sorted, const __global trb_task *tasks, __global trbvh_node *out,
-                            __global uint *prims) {
-  const trb_collapser c = trb_plan_emitter(plan, nodes, 0, keys, sorted, out, prims);
+TRB_KERNEL trb_k_emit_tasks(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trbvh_node *refs,
+                            __global ulong *keys, __global ulong *sorted, const __global trb_task *tasks,
+                            __global trbvh_node *out, __global uint *prims) {
+  const trb_collapser c = trb_plan_emitter(plan, nodes, refs, keys, sorted, out, prims);
   uint i;
   TRB_FOR_JOBS(i, plan->tasks) trb_emit_task(&c, tasks[i]);
 }
@@ -68,6 +68,10 @@ TRB_CORE uint trb_count_prims(const trb_collapser *c, trbvh_node leaf) {
 /* Writes a leaf whose primitives begin at `first`; returns how many they are. */
 TRB_CORE uint trb_emit_leaf(const trb_collapser *c, trbvh_node node, uint dst, uint first) {
   uint prims[TRB_MAX_LEAF], i;
+  if (c->held) {
+    trb_emit_old_leaf(c, node, node.first, dst);
+    return 1;
+  }
   node.count = trb_leaf_prims(c, node, prims);
   node.first = first;
   c->out[dst] = node;
@@ -142,7 +146,7 @@ static void trb_count_inner(const trb_collapser *c, __global trb_place *places, 
     if (trb_is_leaf(child.count)) {
       const uint count = trb_count_prims(c, child);
       sum.prims += count;
-      sum.sah += trb_sah_term(child, c->cost_prim * count);
+      sum.sah += trb_leaf_term(c, child, count);
     } else {
       const trb_place below = places[child.first / 2];
       sum.inner += below.inner;
@@ -188,7 +192,7 @@ TRB_KERNEL trb_k_sum_inner(__global trb_plan *plan, __global trbvh_node *nodes, 
   if (trb_is_leaf(nodes[0].count)) {
     plan->leaves = 1;
     plan->prims = trb_count_prims(&c, nodes[0]);
-    plan->sah = trb_sah_term(nodes[0], c.cost_prim * plan->prims);
+    plan->sah = trb_leaf_term(&c, nodes[0], plan->prims);
   } else {
     __global trb_place *root = &places[nodes[0].first / 2];
     while (levels[depth].count) depth++;

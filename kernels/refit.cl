@@ -1,4 +1,5 @@
-/* Boxes of a tree whose primitives have moved: the same topology, level by level from the bottom up. */
+/* Boxes of a tree whose primitives have moved: the same topology, level by level from the bottom up. And the beginning of
+ * trbvh_cl_optimize: the build nodes of a tree that exists, likewise. */
 #include "shape.cl"
 
 /* One work-group. */
@@ -62,5 +63,24 @@ TRB_KERNEL trb_k_refit_level(__global trbvh_node *nodes, const __global trb_leve
       nodes[node].min[k] = TRB_MIN(left.min[k], right.min[k]);
       nodes[node].max[k] = TRB_MAX(left.max[k], right.max[k]);
     }
+  }
+}
+
+/* ---- A tree that is optimized ---- */
+TRB_KERNEL trb_k_unsettle(const __global trb_plan *plan, const __global trbvh_node *old, __global trbvh_node *nodes,
+                          __global trb_held *held, uint count) {
+  const trb_costs costs = plan->costs;
+  uint i;
+  TRB_FOR(i, count) nodes[i] = trb_unsettle(old[i], i, &held[i], costs);
+}
+
+TRB_KERNEL trb_k_unsettle_level(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,
+                                const __global uint *list, uint level) {
+  const uint first = levels[level].first, count = levels[level].count;
+  const trb_costs costs = plan->costs;
+  uint i;
+  for (i = (uint)get_global_id(0); i < count; i += (uint)get_global_size(0)) {
+    const uint node = list[first + i], pair = nodes[node].first;
+    nodes[node] = trb_parent(nodes[pair], nodes[pair + 1], pair, costs);
   }
 }

@@ -88,7 +88,7 @@ static trb_mesh trb_plan_mesh(const __global trb_plan *plan, const __global char
 static bool trb_has_gaps(const __global trb_plan *plan) { return plan->ref_count != plan->slots; }
 
 /* What the collapse needs to know; keys and sorted are scratch memory by then, for those who need some, as refs is for
- * those who look into leaves. */
+ * those who look into leaves. Of a tree that is optimized that is what they hold. */
 static trb_collapser trb_plan_collapser(const __global trb_plan *plan, __global trbvh_node *nodes,
                                         const __global trbvh_node *refs, __global ulong *keys, __global ulong *sorted) {
   trb_collapser c;
@@ -98,6 +98,7 @@ static trb_collapser trb_plan_collapser(const __global trb_plan *plan, __global 
   c.cost_node = plan->cost_node;
   c.cost_prim = plan->cost_prim;
   c.refs = plan->split_max ? refs : 0;
+  c.held = plan->optimizes ? (const __global trb_held *)refs : 0;
   c.out = 0;
   c.prims = 0;
   return c;

@@ -739,6 +739,50 @@ static void test_refit(void)
   own_close(&o);
 }
 
+/* The nodes that trbvh_optimize makes, whatever the tree, and whatever it is to become. */
+static void test_optimize(void)
+{
+  static const struct { const char *name; uint32_t n; } rows[] = {
+    {"random", 3000}, {"sphere", 3000}, {"slivers", 2000}, {"city", 2500}, {"identical", 500}, {"deep_bushy", 1000},
+    {"n0", 0}, {"n1", 1}, {"n2", 2}, {"n9", 9}};
+  own o;
+  unsigned at;
+  own_open(&o);
+  for (at = 0; at < 3 * sizeof rows / sizeof rows[0] && o.device; ++at) {
+    const unsigned row = at / 3;
+    unsigned quality;
+    mesh m = make_built(rows[row].name, rows[row].n, preset_options((int)at % 3));
+    for (quality = 0; quality < 5; ++quality) {
+      trbvh want = {0};
+      trbvh_cl_tree tree;
+      trbvh_options options = preset_options((int)at % 3);
+      trbvh_stats scalar, stats;
+      struct _cl_event *event = NULL;
+      memset(&tree, 0, sizeof tree);
+      memset(&stats, 0x55, sizeof stats);
+      CONTEXT("scene %s, built %s, quality %u", m.s.name, preset_names[at % 3], quality);
+      CHECK(trbvh_build(&want, &m.g, &options) == TRBVH_OK);
+      CHECK(trbvh_cl_upload(o.device, &tree, &want) == TRBVH_OK);
+      memset(&options, 0, sizeof options);
+      options.quality = (trbvh_quality)quality;
+      options.stats = &scalar;
+      CHECK(trbvh_optimize(&want, &options) == TRBVH_OK);
+      options.stats = quality & 1 ? &stats : NULL;
+      stub_quiet();
+      CHECK_MSG(trbvh_cl_optimize(o.device, &tree, &options, &event) == TRBVH_OK, "%s", trbvh_cl_message(o.device));
+      if (!options.stats) CHECK_MSG(stub.waits <= 1, "waited %u times for the device", stub.waits);
+      else check_stats(&scalar, &stats);
+      if (want.node_count) check_event(event);
+      else if (event) clReleaseEvent(event);
+      check_tree_on_device(&o, &tree, &want, "optimized");
+      trbvh_cl_free(o.device, &tree);
+      trbvh_free(&want);
+    }
+    mesh_free(&m);
+  }
+  own_close(&o);
+}
+
 static void read_rays(const own *o, rays *r, struct _cl_mem *hit, struct _cl_mem *any)
 {
   free(r->hit); free(r->any);
@@ -864,6 +908,21 @@ static void test_arguments_on_the_device(void)
   CHECK(trbvh_cl_intersect(o.device, NULL, buffer, buffer, 1, NULL) == TRBVH_INVALID_ARGUMENT);
   CHECK(trbvh_cl_intersect(o.device, &tree, NULL, buffer, 1, NULL) == TRBVH_INVALID_ARGUMENT);
   CHECK(trbvh_cl_download(o.device, &tree, NULL, NULL) == TRBVH_INVALID_ARGUMENT);
+  CHECK(trbvh_cl_optimize(o.device, NULL, &options, NULL) == TRBVH_INVALID_ARGUMENT && stats.message[0]);
+  CHECK(trbvh_cl_optimize(NULL, &tree, &options, NULL) == TRBVH_NO_DEVICE && stats.message[0]);
+  CONTEXT("optimizing that is cancelled");
+  for (t.cancel_at = 1;; ++t.cancel_at) {
+    trbvh_result result;
+    options.progress = on_tick;
+    t.count = 0;
+    CHECK(trbvh_build(&m.tree, &m.g, NULL) == TRBVH_OK && trbvh_cl_upload(o.device, &tree, &m.tree) == TRBVH_OK);
+    result = trbvh_cl_optimize(o.device, &tree, &options, NULL);
+    CHECK(result == (t.count < t.cancel_at ? TRBVH_OK : TRBVH_CANCELLED));
+    if (result) check_tree_on_device(&o, &tree, &m.tree, "cancelled");
+    if (!result) break;
+  }
+  CHECK_MSG(t.cancel_at > 5, "%u ticks", t.cancel_at);
+  options.progress = NULL;
   trbvh_cl_free(o.device, &tree);
   CHECK(trbvh_cl_upload(o.device, &tree, NULL) == TRBVH_INVALID_ARGUMENT);
   trbvh_cl_free(o.device, NULL);
@@ -1079,6 +1138,48 @@ static void test_failing_calls_on_the_device(void)
   rays_free(&w.r);
   mesh_free(&w.m);
   own_close(&w.o);
+}
+
+/* A tree that could not be optimized is as it was. */
+static void test_failing_calls_of_optimize(void)
+{
+  own o;
+  mesh m = make_built("slivers", 400, preset_options(0));
+  unsigned fault, n;
+  own_open(&o);
+  for (fault = 0; fault < FAULTS && o.device; ++fault) {
+    int last = 0;
+    for (n = 0; !last; n += 1 + n / QUICK_OR(2, 8)) {
+      trbvh_cl_tree tree;
+      trbvh_options options = preset_options(1);
+      trbvh_stats stats;
+      struct _cl_event *event = NULL;
+      trbvh_result result;
+      long buffers;
+      memset(&tree, 0, sizeof tree);
+      memset(&stats, 0x55, sizeof stats);
+      options.stats = &stats;
+      stub_quiet();
+      CONTEXT("%s at call %u", faults[fault].name, n);
+      CHECK(trbvh_cl_upload(o.device, &tree, &m.tree) == TRBVH_OK);
+      buffers = stub.live[STUB_BUFFER];
+      arm(1, fault, n);
+      CONTEXT("%s at call %u", faults[fault].name, n);
+      result = trbvh_cl_optimize(o.device, &tree, &options, &event);
+      last = n && !stub.failed;
+      if (result) {
+        CHECK_MSG(stub.failed && is_device_error(result) && !event, "%s", trbvh_result_text(result));
+        CHECK(stats.message[0] && stats.message[0] != 0x55 && trbvh_cl_message(o.device)[0]);
+        CHECK_MSG(stub.live[STUB_BUFFER] <= buffers || n == 0, "%ld buffers, %ld before", stub.live[STUB_BUFFER], buffers);
+      }
+      stub_quiet();
+      if (event) check_event(event);
+      if (result) check_tree_on_device(&o, &tree, &m.tree, "after a failure");
+      trbvh_cl_free(o.device, &tree);
+    }
+  }
+  mesh_free(&m);
+  own_close(&o);
 }
 
 static void test_little_memory(void)
@@ -1457,11 +1558,13 @@ int main(int argc, char **argv)
   if (found && !WIDE_KEYS) {
     RUN(test_trees_on_the_device);
     RUN(test_refit);
+    RUN(test_optimize);
     RUN(test_rays_on_the_device);
     RUN(test_arguments_on_the_device);
     RUN(test_failing_calls_from_opening_on);
     RUN(test_failing_calls_of_builds);
     RUN(test_failing_calls_on_the_device);
+    RUN(test_failing_calls_of_optimize);
     RUN(test_little_memory);
     if (TRB_CL_SHAPE == 0) {                       /* nothing of this depends on which kernels there are */
       RUN(test_user_kernel);
