@@ -1733,6 +1733,13 @@ typedef struct trb_move {
   float     gain;                        /* in half areas; 0: no move; negative: it was one, but had to stand back */
 } trb_move;
 
+TRB_CORE trb_move trb_no_move(void) {
+  trb_move none;
+  none.node = none.target = none.above = 0;
+  none.gain = 0;
+  return none;
+}
+
 typedef struct trb_mover {
   TRB_GLOBAL trbvh_node *nodes;
   TRB_GLOBAL trbvh_node *refs;           /* where triangles are split: each one's count tells where it is; else NULL */
@@ -1899,7 +1906,8 @@ TRB_SHARED void trb_remake_moved(const trb_mover *m, trbvh_u32 count) {
 #define TRB_SCORES       2048u           /* buckets, by exponent and three bits more: two scores to a word */
 #define TRB_SCORE_SHIFT  20
 #define TRB_SEARCH_STEPS 64u             /* pairs looked at in one search, at most; and so many wait */
-#define TRB_SEARCHES     256u            /* candidates that a job looks at */
+#define TRB_SEARCHES     256u            /* candidates that a job looks at ... */
+#define TRB_MOVES        1024u           /* ... and that it moves */
 
 TRB_CORE trbvh_u32 trb_score(float above, float area, float both) {
   const float tame = TRB_MIN(both, 1 / TRB_TINY), ratio = above * trb_reciprocal(TRB_MAX(tame, TRB_TINY));
@@ -2128,14 +2136,12 @@ TRB_CORE void trb_find_ref(const trb_mover *m, trbvh_u32 slot) {
 }
 
 /* The merge of reference i and the next one of its triangle that is still there; of every fourth one in a batch. */
-TRB_CORE void trb_search_merge(const trb_mover *m, trbvh_u32 i, trbvh_u32 slots) {
-  TRB_GLOBAL trb_move *move = &m->moves[i / TRB_MOVE_BATCHES];
+TRB_CORE trb_move trb_search_merge(const trb_mover *m, trbvh_u32 i, trbvh_u32 slots) {
   const trbvh_u32 prim = m->refs[i].first;
   trbvh_u32 next = i + 1;
-  move->gain = 0;
-  if (prim == TRBVH_NONE || m->refs[i].count == TRBVH_NONE) return;
+  if (prim == TRBVH_NONE || m->refs[i].count == TRBVH_NONE) return trb_no_move();
   while (next < slots && m->refs[next].first == prim && m->refs[next].count == TRBVH_NONE) next++;
-  if (next < slots && m->refs[next].first == prim) *move = trb_find_merge(m, i, next);
+  return next < slots && m->refs[next].first == prim ? trb_find_merge(m, i, next) : trb_no_move();
 }
 
 /* Takes a leaf away, its sibling getting their parent's place, and grows another one. Afterwards the move tells below
@@ -3131,6 +3137,7 @@ typedef struct trb_build {
   trb_block            *blocks;
   trb_range            *ranges;          /* for each TRB_BLOCK of ref_max */     uint32_t *histograms;  /* the sort's, smaller */
                                                                                  trb_u64 *sums;
+                                                                                 uint32_t *more, *found;   /* bits; moves of each job */
   trb_group            *groups;
   trb_task             *tasks;
   trb_held             *held;             /* by node, of a tree that is optimized */
@@ -3295,6 +3302,8 @@ static size_t trb_lay_out(trb_build *b, char *base) {
   b->unsplit = b->nodes;
   b->histograms = (uint32_t *)(void *)b->ranges;
   b->sums = (trb_u64 *)(void *)b->ranges;
+  b->more = b->histograms;
+  b->found = b->histograms + blocks * (TRB_BLOCK / 32);
   return size + TRB_LINE;
 }
 
@@ -3798,27 +3807,56 @@ static void trb_search_job(void *context, uint32_t index) {
   for (; i < end; i++) trb_search(&m, i, b->batch, trb_least_gain(b->lowest_score));
 }
 
-/* The last batch is for those that had to stand back in the one before. */
-static int trb_reinsert_candidates(trb_build *b) {
+static void trb_reinsert_job(void *context, uint32_t index) {
+  const trb_build *b = (const trb_build *)context;
   const trb_mover m = trb_build_mover(b);
-  uint32_t wanted = (uint32_t)(b->options.reinsert_share * (float)b->ref_count), i;
-  if (wanted == 0) return 0;
-  if (trb_find_candidates(b, wanted)) return 1;
-  memset(m.owners, 0xFF, (size_t)b->ref_count * sizeof *m.owners);
-  for (b->batch = 0; b->batch <= TRB_MOVE_BATCHES; b->batch++) {
-    if (trb_run_moves(b, trb_blocks(b->move_count, TRB_SEARCHES), trb_search_job)) return 1;
-    trb_choose_moves(&m, b->move_count);
-    for (i = 0; i < b->move_count; i++)
-      if (m.moves[i].gain > 0) trb_reinsert(&m, &m.moves[i]);
-    trb_remake_moved(&m, b->move_count);
-  }
+  uint32_t i = index * TRB_MOVES, end = TRB_MIN(b->move_count, i + TRB_MOVES);
+  for (; i < end; i++)
+    if (m.moves[i].gain > 0) trb_reinsert(&m, &m.moves[i]);
+}
+
+static void trb_merge_job(void *context, uint32_t index) {
+  const trb_build *b = (const trb_build *)context;
+  const trb_mover m = trb_build_mover(b);
+  uint32_t i = index * TRB_MOVES, end = TRB_MIN(b->move_count, i + TRB_MOVES);
+  for (; i < end; i++)
+    if (m.moves[i].gain > 0) trb_merge_refs(&m, &m.moves[i]);
+}
+
+/* What a batch has found. */
+static int trb_make_moves(trb_build *b, trbvh_job *job) {
+  const trb_mover m = trb_build_mover(b);
+  trb_choose_moves(&m, b->move_count);
+  if (trb_run(&b->runner, trb_blocks(b->move_count, TRB_MOVES), job, b)) return 1;
+  trb_remake_moved(&m, b->move_count);
   return 0;
 }
 
+/* The last batch is for those that had to stand back in the one before. */
+static int trb_reinsert_candidates(trb_build *b) {
+  const uint32_t wanted = (uint32_t)(b->options.reinsert_share * (float)b->ref_count);
+  if (wanted == 0) return 0;
+  if (trb_find_candidates(b, wanted)) return 1;
+  memset(trb_build_mover(b).owners, 0xFF, (size_t)b->ref_count * sizeof(uint32_t));
+  for (b->batch = 0; b->batch <= TRB_MOVE_BATCHES; b->batch++)
+    if (trb_run_moves(b, trb_blocks(b->move_count, TRB_SEARCHES), trb_search_job) || trb_make_moves(b, trb_reinsert_job)) return 1;
+  return 0;
+}
+
+/* Few triangles are split: a bit for every slot tells whether the next one holds another reference of the same. */
 static void trb_forget_refs_job(void *context, uint32_t index) {
   const trb_build *b = (const trb_build *)context;
-  uint32_t i = index * TRB_BLOCK, end = TRB_MIN(b->slot_count, i + TRB_BLOCK);
-  for (; i < end; i++) b->refs[i].count = TRBVH_NONE;
+  uint32_t i = index * TRB_BLOCK, end = TRB_MIN(b->slot_count, i + TRB_BLOCK), bits = 0;
+  for (; i < end; i++) {
+    const uint32_t prim = b->refs[i].first;
+    const uint32_t more = i + 1 < b->slot_count && prim != TRBVH_NONE && b->refs[i + 1].first == prim;
+    bits |= more << (i & 31);
+    if ((i & 31) == 31 || i + 1 == end) {
+      b->more[i / 32] = bits;
+      bits = 0;
+    }
+    b->refs[i].count = TRBVH_NONE;
+  }
 }
 
 static void trb_find_refs_job(void *context, uint32_t index) {
@@ -3831,25 +3869,37 @@ static void trb_find_refs_job(void *context, uint32_t index) {
 static void trb_search_merges_job(void *context, uint32_t index) {
   const trb_build *b = (const trb_build *)context;
   const trb_mover m = trb_build_mover(b);
-  uint32_t i = index * TRB_SEARCHES, end = TRB_MIN(b->move_count, i + TRB_SEARCHES);
-  for (; i < end; i++) trb_search_merge(&m, i * TRB_MOVE_BATCHES + b->batch, b->slot_count);
+  const uint32_t each = TRB_SEARCHES * TRB_MOVE_BATCHES, most = TRB_MOVES_MAX(b->slot_count) * TRB_MOVE_BATCHES;
+  uint32_t i = index * each, end = TRB_MIN(most, i + each), bits, found = 0;
+  for (; i < end; i += 32)
+    for (bits = b->more[i / 32] & 0x11111111u << b->batch; bits; bits &= bits - 1) {
+      const uint32_t ref = i + trb_log2(bits & (0 - bits));
+      const trb_move move = ref < most ? trb_search_merge(&m, ref, b->slot_count) : trb_no_move();
+      if (move.gain > 0) m.moves[index * TRB_SEARCHES + found++] = move;
+    }
+  b->found[index] = found;
+}
+
+static int trb_search_merges(trb_build *b) {
+  const trb_mover m = trb_build_mover(b);
+  const uint32_t jobs = trb_blocks(b->slot_count, TRB_SEARCHES * TRB_MOVE_BATCHES);
+  uint32_t i;
+  if (trb_run_moves(b, jobs, trb_search_merges_job)) return 1;
+  for (i = b->move_count = 0; i < jobs; i++) {
+    memmove(m.moves + b->move_count, m.moves + i * TRB_SEARCHES, b->found[i] * sizeof *m.moves);
+    b->move_count += b->found[i];
+  }
+  return 0;
 }
 
 static int trb_unsplit(trb_build *b, uint32_t passes) {
-  const trb_mover m = trb_build_mover(b);
-  uint32_t pass, i;
+  uint32_t pass;
   if (!b->refs || trb_run_moves(b, trb_blocks(b->slot_count, TRB_BLOCK), trb_forget_refs_job) ||
       trb_run_moves(b, trb_pair_blocks(b), trb_find_refs_job)) return b->runner.cancelled;
-  memset(m.owners, 0xFF, (size_t)b->ref_count * sizeof *m.owners);
-  b->move_count = TRB_MOVES_MAX(b->slot_count);
+  memset(trb_build_mover(b).owners, 0xFF, (size_t)b->ref_count * sizeof(uint32_t));
   for (pass = 0; pass < passes; pass++)
-    for (b->batch = 0; b->batch < TRB_MOVE_BATCHES; b->batch++) {
-      if (trb_run_moves(b, trb_blocks(b->move_count, TRB_SEARCHES), trb_search_merges_job)) return 1;
-      trb_choose_moves(&m, b->move_count);
-      for (i = 0; i < b->move_count; i++)
-        if (m.moves[i].gain > 0) trb_merge_refs(&m, &m.moves[i]);
-      trb_remake_moved(&m, b->move_count);
-    }
+    for (b->batch = 0; b->batch < TRB_MOVE_BATCHES; b->batch++)
+      if (trb_search_merges(b) || trb_make_moves(b, trb_merge_job)) return 1;
   return 0;
 }
 

@@ -163,9 +163,9 @@ TRB_KERNEL trb_k_search_merges(const __global trb_plan *plan, __global trbvh_nod
   uint job;
   TRB_FOR_JOBS(job, (count + TRB_SEARCHES - 1) / TRB_SEARCHES)
     for (i = job * TRB_SEARCHES; i < count && i < (job + 1) * TRB_SEARCHES; i++)
-      trb_search_merge(&m, i * TRB_MOVE_BATCHES + batch, slots);
+      m.moves[i] = trb_search_merge(&m, i * TRB_MOVE_BATCHES + batch, slots);
 #else
-  TRB_FOR(i, count) trb_search_merge(&m, i * TRB_MOVE_BATCHES + batch, slots);
+  TRB_FOR(i, count) m.moves[i] = trb_search_merge(&m, i * TRB_MOVE_BATCHES + batch, slots);
 #endif
 }
 
