@@ -35,7 +35,7 @@
  *   MEDIUM  the default: and three rounds of treelet restructuring, between them the nodes that seem worst placed,
  *           4 % of all, move to better places
  *   HIGH    and triangles split first, 20 % more references at most; splits that do not pay are taken back
- *   BEST    the same with more of everything: five rounds, 25 % of the nodes, 50 % of splits at most; for trees made once
+ *   BEST    the same with more of everything: five rounds, 8 % of the nodes, 50 % of splits at most; for trees made once
  *   The paper's own settings: FAST with treelet_rounds 3 and, with splits, split_budget 0.3.
  *
  * WHAT IS PROMISED
@@ -217,8 +217,7 @@ typedef struct trbvh_options {
                                             at most 0.25. Rounds then go from large subtrees to small ones: those of
                                             gamma * 4^(rounds - 1 - r) references or more in round r; none (negative):
                                             gamma * 2^r, which is the paper's */
-  int32_t         unsplit_passes;        /* over all splits before the first round, to take back those that do not pay, and
-                                            one fewer each time before the next rounds, but one at least; at most 16.
+  int32_t         unsplit_passes;        /* over all splits before each round, to take back those that do not pay; at most 16.
                                             With reinsertion there are no splits at all where they hardly pay altogether */
 } trbvh_options;
 struct trbvh_stats {
@@ -2917,8 +2916,10 @@ TRBVH_API void trbvh_free(trbvh *bvh) {
     #define trb_wake_all(s)              WakeAllConditionVariable(s)
     #define trb_thread_start(t, f, p)    ((*(t) = CreateThread(NULL, 0, f, p, 0, NULL)) != NULL)
     #define trb_thread_join(t)           (WaitForSingleObject(t, INFINITE), CloseHandle(t))
+    #define trb_yield()                  SwitchToThread()
   #else
     #include <pthread.h>
+    #include <sched.h>
     typedef pthread_t trb_thread;
     typedef pthread_mutex_t trb_mutex;
     typedef pthread_cond_t trb_signal;
@@ -2933,8 +2934,10 @@ TRBVH_API void trbvh_free(trbvh *bvh) {
     #define trb_wake_all(s)              pthread_cond_broadcast(s)
     #define trb_thread_start(t, f, p)    (pthread_create(t, NULL, f, p) == 0)
     #define trb_thread_join(t)           pthread_join(t, NULL)
+    #define trb_yield()                  sched_yield()
   #endif
   #define TRB_THREADS_MAX 64u
+  #define TRB_YIELDS      1000u          /* less than 1 ms: waking a thread may take as long as a stage of moves */
 
 /* Threads that live as long as one call of the library. Jobs are coarse, so that a mutex hands them out. */
 typedef struct trb_pool {
@@ -2961,18 +2964,27 @@ static void trb_pool_work(trb_pool *pool) {          /* entered and left with th
   if (pool->running == 0) trb_wake_all(&pool->idle);
 }
 
+static void trb_pool_yield(trb_pool *pool) {
+  trb_unlock(&pool->mutex);
+  trb_yield();
+  trb_lock(&pool->mutex);
+}
+
 static TRB_THREAD_MAIN trb_pool_thread(void *p) {
   trb_pool *pool = (trb_pool *)p;
+  uint32_t yields;
   trb_lock(&pool->mutex);
   while (!pool->quit) {
     trb_pool_work(pool);
-    if (!pool->quit) trb_wait(&pool->work, &pool->mutex);
+    for (yields = 0; yields < TRB_YIELDS && !pool->quit && pool->next == pool->count; yields++) trb_pool_yield(pool);
+    if (!pool->quit && pool->next == pool->count) trb_wait(&pool->work, &pool->mutex);
   }
   trb_unlock(&pool->mutex);
   return 0;
 }
 
 static void trb_pool_run(trb_pool *pool, uint32_t count, trbvh_job *job, void *context) {
+  uint32_t yields;
   trb_lock(&pool->mutex);
   pool->job = job;
   pool->context = context;
@@ -2980,6 +2992,7 @@ static void trb_pool_run(trb_pool *pool, uint32_t count, trbvh_job *job, void *c
   pool->count = count;
   trb_wake_all(&pool->work);
   trb_pool_work(pool);
+  for (yields = 0; yields < TRB_YIELDS && pool->running; yields++) trb_pool_yield(pool);
   while (pool->running) trb_wait(&pool->idle, &pool->mutex);
   trb_unlock(&pool->mutex);
 }
@@ -3229,9 +3242,9 @@ static trbvh_result trb_resolve_options(trb_build *b, const trbvh_options *optio
   if (o->treelet_rounds < 0) o->treelet_rounds = 0;
   if (o->treelet_rounds > TRB_ROUNDS_MAX) o->treelet_rounds = TRB_ROUNDS_MAX;
   if (o->treelet_gamma < TRB_TREELET) o->treelet_gamma = TRB_TREELET;
-  if (o->reinsert_share == 0 && !fast) o->reinsert_share = best ? 0.25f : 0.04f;
+  if (o->reinsert_share == 0 && !fast) o->reinsert_share = best ? 0.08f : 0.04f;
   if (o->reinsert_share < 0) o->reinsert_share = 0;
-  if (o->unsplit_passes == 0 && high) o->unsplit_passes = best ? 3 : 2;
+  if (o->unsplit_passes == 0 && high) o->unsplit_passes = 1;
   if (o->unsplit_passes < 0) o->unsplit_passes = 0;
   if (o->unsplit_passes > TRB_UNSPLITS_MAX) o->unsplit_passes = TRB_UNSPLITS_MAX;
   if (o->max_leaf == 0) o->max_leaf = 8;
@@ -4087,12 +4100,11 @@ static uint32_t trb_phases(const trb_build *b) {
 
 static void trb_start_phase(trb_build *b, uint32_t phase) {
   const uint32_t phases = trb_phases(b), gamma = (uint32_t)b->options.treelet_gamma;
-  const uint32_t passes = b->splitting ? (uint32_t)b->options.unsplit_passes : 0;
   const uint32_t shift = TRB_MIN(2 * (phases - 1 - phase), 31u);
   b->phase.last = phase + 1 == phases;
   b->phase.rounds = phases > 1 ? 1 : (uint32_t)b->options.treelet_rounds;
   b->phase.gamma = gamma > TRB_REFS_MAX >> shift ? TRB_REFS_MAX : gamma << shift;
-  b->phase.unsplits = passes > phase + 1 ? passes - phase : TRB_MIN(passes, 1);
+  b->phase.unsplits = b->splitting ? (uint32_t)b->options.unsplit_passes : 0;
 }
 
 /* Does one more tree say whether splits are kept? Not where all are to be, as in the paper. */
