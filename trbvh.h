@@ -34,9 +34,11 @@
  *   FAST    LBVH and collapse: for trees that see fewer than some three rays a triangle, then are rebuilt
  *   MEDIUM  the default: and three rounds of treelet restructuring, between them the nodes that seem worst placed,
  *           4 % of all, move to better places
- *   HIGH    and triangles split first, 20 % more references at most; splits that do not pay are taken back
+ *   HIGH    and triangles split first, 20 % more references at most. Splits that do not pay are taken back, and where they
+ *           hardly pay altogether, MEDIUM's tree is made: rays are never slower
  *   BEST    the same with more of everything: five rounds, 8 % of the nodes, 50 % of splits at most; for trees made once
  *   The paper's own settings: FAST with treelet_rounds 3 and, with splits, split_budget 0.3.
+ *   A tree that exists, made by a faster preset or refitted, gets better with trbvh_optimize.
  *
  * WHAT IS PROMISED
  *   Same input, same options: the same tree bit for bit, whatever the number of threads, the compiler, the
@@ -2172,17 +2174,16 @@ TRB_CORE float trb_cost_unit(trbvh_node root, trb_costs costs) {
 
 TRB_CORE trbvh_u32 trb_round_cost(float cost) { return (trbvh_u32)TRB_MIN(cost, 2147483520.0f); }   /* areas may be infinite, or NaN */
 
+TRB_CORE trbvh_u32 trb_leaf_cost(trbvh_node n, float unit, trb_costs costs) {
+  return trb_is_leaf(n.count) ? trb_round_cost(unit * trb_area(n) * (0.5f * costs.ratio * (float)trb_count(n.count))) : 0;
+}
+
 /* The part of a pair's parent in it, and of the pair's leaves; none below a leaf. */
 TRB_CORE trb_u64 trb_pair_cost(const TRB_GLOBAL trbvh_node *nodes, trbvh_u32 pair, float unit, trb_costs costs) {
   const trbvh_node left = nodes[2 * pair], right = nodes[2 * pair + 1];
   const trbvh_node parent = trb_parent(left, right, 0, costs);
-  const float weight = 0.5f * costs.ratio * unit;
-  trb_u64 cost = 0;
   if (trb_is_free(left) || trb_is_leaf(parent.count)) return 0;
-  cost += trb_round_cost(unit * trb_area(parent));
-  if (trb_is_leaf(left.count)) cost += trb_round_cost(weight * trb_area(left) * (float)trb_count(left.count));
-  if (trb_is_leaf(right.count)) cost += trb_round_cost(weight * trb_area(right) * (float)trb_count(right.count));
-  return cost;
+  return (trb_u64)trb_round_cost(unit * trb_area(parent)) + trb_leaf_cost(left, unit, costs) + trb_leaf_cost(right, unit, costs);
 }
 
 // >>collapse ---- subtrees that are cheaper as leaves become leaves, and the tree moves into its final layout --------

@@ -121,7 +121,7 @@ TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines);
 
 // >>kernels begin ---- made by kernels/embed.c from trbvh.h and kernels/*.cl: do not edit ---------------------------
 static const char *const trb_cl_text[] = {
-  "#line 85 \"trbvh.h\"\n",
+  "#line 87 \"trbvh.h\"\n",
   "#define TRBVH_VERSION_MAJOR 0\n",
   "#define TRBVH_VERSION_MINOR 1\n",
   "#define TRBVH_VERSION_PATCH 0\n",
@@ -131,7 +131,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "  #define TRBVH_OPENCL_C 1\n",
   "  typedef uint trbvh_u32;\n",
-  "#line 99 \"trbvh.h\"\n",
+  "#line 101 \"trbvh.h\"\n",
   "#define TRBVH_NONE      0xFFFFFFFFu\n",
   "#define TRBVH_MAX_DEPTH 64\n",
   "\n",
@@ -157,9 +157,9 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "typedef struct trbvh_hit { float t, u, v; trbvh_u32 prim; trbvh_u32 instance; } trbvh_hit;\n",
-  "#line 284 \"trbvh.h\"\n",
+  "#line 286 \"trbvh.h\"\n",
   "  #pragma OPENCL FP_CONTRACT OFF\n",
-  "#line 295 \"trbvh.h\"\n",
+  "#line 297 \"trbvh.h\"\n",
   "  #ifdef TRB_OUTLINE\n",
   "    #define TRB_CORE static inline __attribute__((unused))\n",
   "  #else\n",
@@ -178,11 +178,11 @@ static const char *const trb_cl_text[] = {
   "  #endif\n",
   "  #define trb_bits(x)  as_uint(x)\n",
   "  #define trb_float(x) as_float(x)\n",
-  "#line 335 \"trbvh.h\"\n",
+  "#line 337 \"trbvh.h\"\n",
   "#ifndef TRB_PREFETCH\n",
   "  #define TRB_PREFETCH(address) ((void)(address))\n",
   "#endif\n",
-  "#line 394 \"trbvh.h\"\n",
+  "#line 396 \"trbvh.h\"\n",
   "#ifndef TRBVH_ASSERT\n",
   "  #define TRBVH_ASSERT(x) ((void)0)\n",
   "#endif\n",
@@ -190,17 +190,17 @@ static const char *const trb_cl_text[] = {
   "\n",
   "    #define TRB_REAL float\n",
   "    #define TRB_NOISE 9.5367432e-7f\n",
-  "#line 405 \"trbvh.h\"\n",
+  "#line 407 \"trbvh.h\"\n",
   "#endif\n",
   "\n",
   "  #define TRB_ALIGNED(type) type __attribute__((aligned(64)))\n",
-  "#line 413 \"trbvh.h\"\n",
+  "#line 415 \"trbvh.h\"\n",
   "#if defined(__cplusplus) || defined(_MSC_VER)\n",
   "  #define TRB_RESTRICT __restrict\n",
   "#else\n",
   "  #define TRB_RESTRICT restrict\n",
   "#endif\n",
-  "#line 428 \"trbvh.h\"\n",
+  "#line 430 \"trbvh.h\"\n",
   "#define TRB_MIN(a, b) ((a) < (b) ? (a) : (b))\n",
   "#define TRB_MAX(a, b) ((a) > (b) ? (a) : (b))\n",
   "\n",
@@ -237,7 +237,7 @@ static const char *const trb_cl_text[] = {
   "  for (i = 0; i < 4; i++) r = r * (4.0f - x * r * r * r) * 0.333333343f;\n",
   "  return x * r * r;\n",
   "}\n",
-  "#line 474 \"trbvh.h\"\n",
+  "#line 476 \"trbvh.h\"\n",
   "#define TRB_MAX_LEAF 16u\n",
   "#define TRB_SMALL    0x80000000u\n",
   "#define TRB_LEAF     0x40000000u\n",
@@ -317,7 +317,7 @@ static const char *const trb_cl_text[] = {
   "  return trb_morton(0.5f * box.min[0] + 0.5f * box.max[0], 0.5f * box.min[1] + 0.5f * box.max[1],\n",
   "                    0.5f * box.min[2] + 0.5f * box.max[2], grid);\n",
   "}\n",
-  "#line 566 \"trbvh.h\"\n",
+  "#line 568 \"trbvh.h\"\n",
   "#define TRB_TREELET 7\n",
   "#define TRB_GPU_LANES 32u\n",
   "#if defined(TRB_GPU)\n",
@@ -364,7 +364,7 @@ static const char *const trb_cl_text[] = {
   "  1 << TRB_SKIP(1, without), 1 << TRB_SKIP(2, without), 1 << TRB_SKIP(3, without), 1 << TRB_SKIP(4, without), \\\n",
   "  1 << TRB_SKIP(5, without)))\n",
   "#define TRB_SKIP(i, without) ((i) + ((i) >= (without)))\n",
-  "#line 616 \"trbvh.h\"\n",
+  "#line 618 \"trbvh.h\"\n",
   "#define TRB_DEFINE_TREELET_COSTS(function) \\\n",
   "  function(const TRB_WORK float *TRB_RESTRICT leaves, TRB_WORK float *TRB_RESTRICT table, float *TRB_RESTRICT sums, \\\n",
   "           trb_costs costs) { \\\n",
@@ -440,7 +440,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "TRB_CORE int trb_improves(float cost, float old_cost) { return cost < old_cost - old_cost * 3.8147e-6f; }\n",
-  "#line 696 \"trbvh.h\"\n",
+  "#line 698 \"trbvh.h\"\n",
   "typedef struct trb_plane { int axis, level; float position; } trb_plane;\n",
   "#define TRB_TINY 1e-30f\n",
   "\n",
@@ -530,7 +530,7 @@ static const char *const trb_cl_text[] = {
   "    for (j = 0; j < 3; j++) polygon[i][j] = kept[i][j];\n",
   "  return count;\n",
   "}\n",
-  "#line 790 \"trbvh.h\"\n",
+  "#line 792 \"trbvh.h\"\n",
   "TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {\n",
   "  float polygon[TRB_POLYGON][3], pad[3];\n",
   "  trbvh_node bounds = *box;\n",
@@ -559,7 +559,7 @@ static const char *const trb_cl_text[] = {
   "  *box = bounds;\n",
   "  return 1;\n",
   "}\n",
-  "#line 822 \"trbvh.h\"\n",
+  "#line 824 \"trbvh.h\"\n",
   "  typedef struct trb_mesh {\n",
   "    const __global char *positions, *indices, *boxes;\n",
   "    ulong position_stride, box_stride;\n",
@@ -574,7 +574,7 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE float trb_load_float(const TRB_GLOBAL char *p) {\n",
   "\n",
   "  return *(const __global float *)p;\n",
-  "#line 844 \"trbvh.h\"\n",
+  "#line 846 \"trbvh.h\"\n",
   "}\n",
   "\n",
   "TRB_CORE void trb_load_position(float out[3], const TRB_GLOBAL char *p) {\n",
@@ -586,13 +586,13 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE trbvh_u32 trb_index16(const trb_mesh *mesh, size_t i) {\n",
   "\n",
   "  return ((const __global ushort *)mesh->indices)[i];\n",
-  "#line 860 \"trbvh.h\"\n",
+  "#line 862 \"trbvh.h\"\n",
   "}\n",
   "\n",
   "TRB_CORE trbvh_u32 trb_index32(const trb_mesh *mesh, size_t i) {\n",
   "\n",
   "  return ((const __global uint *)mesh->indices)[i];\n",
-  "#line 870 \"trbvh.h\"\n",
+  "#line 872 \"trbvh.h\"\n",
   "}\n",
   "\n",
   "TRB_CORE trbvh_u32 trb_index(const trb_mesh *mesh, size_t i) {\n",
@@ -804,7 +804,7 @@ static const char *const trb_cl_text[] = {
   "  grid.cells_per_unit = extent > 1e-30f && extent < FLT_MAX ? trb_reciprocal(grid.units_per_cell) : 0;\n",
   "  return grid;\n",
   "}\n",
-  "#line 1087 \"trbvh.h\"\n",
+  "#line 1089 \"trbvh.h\"\n",
   "#define TRB_SCALE_BITS  36\n",
   "#define TRB_SCALES      2561u\n",
   "#define TRB_SPLIT_STACK 64u\n",
@@ -862,7 +862,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "  return count;\n",
   "}\n",
-  "#line 1150 \"trbvh.h\"\n",
+  "#line 1152 \"trbvh.h\"\n",
   "#ifndef TRB_PACKED_REFS\n",
   "  #define TRB_PACKED_REFS (1u << 24)\n",
   "#endif\n",
@@ -922,7 +922,7 @@ static const char *const trb_cl_text[] = {
   "      start += n;\n",
   "    }\n",
   "}\n",
-  "#line 1217 \"trbvh.h\"\n",
+  "#line 1219 \"trbvh.h\"\n",
   "#define TRB_BLOCK    16384u\n",
   "#define TRB_TOP      1024u\n",
   "#define TRB_NEAR     98304u\n",
@@ -944,7 +944,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "TRB_CORE trbvh_node trb_curve_ref(const trb_curve *c, trb_u64 key) {\n",
   "  const trbvh_u32 ref = trb_key_ref(key, c->form);\n",
-  "#line 1248 \"trbvh.h\"\n",
+  "#line 1250 \"trbvh.h\"\n",
   "  return c->refs[ref];\n",
   "}\n",
   "\n",
@@ -952,7 +952,7 @@ static const char *const trb_cl_text[] = {
   "TRB_SHARED void trb_read_leaves(const trb_curve *c, trbvh_u32 first, trbvh_u32 count, trbvh_u32 end, trb_row *row) {\n",
   "  const trbvh_u32 next = first + count, soon = TRB_MIN(next + TRB_ROW, end);\n",
   "  trbvh_u32 i, k;\n",
-  "#line 1265 \"trbvh.h\"\n",
+  "#line 1267 \"trbvh.h\"\n",
   "  for (i = next; i < soon; i++) TRB_PREFETCH(&c->refs[trb_key_ref(c->keys[i], c->form)]);\n",
   "  for (i = 0; i < count; i++) {\n",
   "    const trbvh_node ref = c->refs[trb_key_ref(c->keys[first + i], c->form)];\n",
@@ -971,7 +971,7 @@ static const char *const trb_cl_text[] = {
   "  code = trb_box_code(trb_curve_ref(c, a), c->grid) ^ trb_box_code(trb_curve_ref(c, b), c->grid);\n",
   "  return code ? code | (trb_u64)1 << 63 : (trbvh_u32)(a ^ b);\n",
   "}\n",
-  "#line 1287 \"trbvh.h\"\n",
+  "#line 1289 \"trbvh.h\"\n",
   "typedef struct trb_open {\n",
   "  trbvh_node node;\n",
   "  trb_u64    split;\n",
@@ -988,7 +988,7 @@ static const char *const trb_cl_text[] = {
   "  trbvh_u32  end, pairs;\n",
   "  struct { trb_u64 split; trbvh_u32 pair, prim, first_pair; } stack[TRB_OPEN_MAX];\n",
   "} trb_forest;\n",
-  "#line 1307 \"trbvh.h\"\n",
+  "#line 1309 \"trbvh.h\"\n",
   "#define TRB_TO_RESTRUCTURE 0\n",
   "#define TRB_FINAL_BLOCK    1\n",
   "#define TRB_FINAL_TOP      2\n",
@@ -1092,7 +1092,7 @@ static const char *const trb_cl_text[] = {
   "    }\n",
   "  TRBVH_ASSERT(f.height == 1);\n",
   "}\n",
-  "#line 1414 \"trbvh.h\"\n",
+  "#line 1416 \"trbvh.h\"\n",
   "#define TRB_LANE_LOAD(p)     (*(p))\n",
   "#define TRB_LANE_STORE(p, x) (*(p) = (x))\n",
   "#define TRB_LANE_OF(x)       (x)\n",
@@ -1210,7 +1210,7 @@ static const char *const trb_cl_text[] = {
   "  for (lane = 0; lane < lanes; lane++) trb_treelet_costs_1(leaves + lane, table + lane, sums + lane, costs);\n",
   "}\n",
   "#endif\n",
-  "#line 1545 \"trbvh.h\"\n",
+  "#line 1547 \"trbvh.h\"\n",
   "typedef struct trb_treelets {\n",
   "  float     leaves[TRB_TREELET * TRB_LEAF_VALUES * TRB_LANES];\n",
   "  float     table[TRB_SUBSETS * TRB_LANES + 16];\n",
@@ -1386,7 +1386,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "}\n",
   "#endif\n",
-  "#line 1729 \"trbvh.h\"\n",
+  "#line 1731 \"trbvh.h\"\n",
   "typedef struct trb_move {\n",
   "  trbvh_u32 node, target;\n",
   "  trbvh_u32 above;\n",
@@ -1554,7 +1554,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "}\n",
   "#endif\n",
-  "#line 1904 \"trbvh.h\"\n",
+  "#line 1906 \"trbvh.h\"\n",
   "#define TRB_MOVE_BATCHES 4u\n",
   "#define TRB_SCORES       2048u\n",
   "#define TRB_SCORE_SHIFT  20\n",
@@ -1593,7 +1593,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "TRB_CORE float trb_least_gain(trbvh_u32 lowest) { return trb_float(lowest << TRB_SCORE_SHIFT) * 0.0625f; }\n",
-  "#line 1947 \"trbvh.h\"\n",
+  "#line 1949 \"trbvh.h\"\n",
   "TRB_SHARED trb_move trb_find_place(const trb_mover *m, trbvh_u32 node, float least) {\n",
   "  const trbvh_node n = m->nodes[node];\n",
   "  const float area = trb_area(n);\n",
@@ -1706,7 +1706,7 @@ static const char *const trb_cl_text[] = {
   "        m->moves[at++].gain = 0;\n",
   "      }\n",
   "}\n",
-  "#line 2068 \"trbvh.h\"\n",
+  "#line 2070 \"trbvh.h\"\n",
   "#define TRB_UNSPLIT_BIAS 2.0f\n",
   "\n",
   "\n",
@@ -1799,7 +1799,7 @@ static const char *const trb_cl_text[] = {
   "  if (move->target == (move->node ^ 1u)) move->target = parent;\n",
   "  move->above = parent;\n",
   "}\n",
-  "#line 2166 \"trbvh.h\"\n",
+  "#line 2168 \"trbvh.h\"\n",
   "#define TRB_SPLITS_PAY 0.98\n",
   "\n",
   "\n",
@@ -1809,19 +1809,18 @@ static const char *const trb_cl_text[] = {
   "\n",
   "TRB_CORE trbvh_u32 trb_round_cost(float cost) { return (trbvh_u32)TRB_MIN(cost, 2147483520.0f); }\n",
   "\n",
+  "TRB_CORE trbvh_u32 trb_leaf_cost(trbvh_node n, float unit, trb_costs costs) {\n",
+  "  return trb_is_leaf(n.count) ? trb_round_cost(unit * trb_area(n) * (0.5f * costs.ratio * (float)trb_count(n.count))) : 0;\n",
+  "}\n",
+  "\n",
   "\n",
   "TRB_CORE trb_u64 trb_pair_cost(const TRB_GLOBAL trbvh_node *nodes, trbvh_u32 pair, float unit, trb_costs costs) {\n",
   "  const trbvh_node left = nodes[2 * pair], right = nodes[2 * pair + 1];\n",
   "  const trbvh_node parent = trb_parent(left, right, 0, costs);\n",
-  "  const float weight = 0.5f * costs.ratio * unit;\n",
-  "  trb_u64 cost = 0;\n",
   "  if (trb_is_free(left) || trb_is_leaf(parent.count)) return 0;\n",
-  "  cost += trb_round_cost(unit * trb_area(parent));\n",
-  "  if (trb_is_leaf(left.count)) cost += trb_round_cost(weight * trb_area(left) * (float)trb_count(left.count));\n",
-  "  if (trb_is_leaf(right.count)) cost += trb_round_cost(weight * trb_area(right) * (float)trb_count(right.count));\n",
-  "  return cost;\n",
+  "  return (trb_u64)trb_round_cost(unit * trb_area(parent)) + trb_leaf_cost(left, unit, costs) + trb_leaf_cost(right, unit, costs);\n",
   "}\n",
-  "#line 2202 \"trbvh.h\"\n",
+  "#line 2203 \"trbvh.h\"\n",
   "typedef struct trb_held { trbvh_u32 first, count; } trb_held;\n",
   "\n",
   "typedef struct trb_collapser {\n",
@@ -2044,7 +2043,7 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE void trb_prefetch_pairs(const trb_collapser *c, trbvh_u32 ref, trbvh_u32 count) {\n",
   "  for (; count-- && ref > 2 * TRB_AHEAD; ref--) TRB_PREFETCH(&c->nodes[2 * (ref - 2 * TRB_AHEAD)]);\n",
   "}\n",
-  "#line 2428 \"trbvh.h\"\n",
+  "#line 2429 \"trbvh.h\"\n",
   "TRB_SHARED void trb_settle_task(const trb_collapser *c, TRB_GLOBAL trb_task *task) {\n",
   "  TRB_GLOBAL trbvh_u32 *order = c->words.plane[0] + task->first_ref, *prims = c->words.plane[1] + task->first_ref;\n",
   "  trbvh_u32 waiting = 0, pairs = 0, refs = task->first_ref, prim = 0, max_depth = 0, i;\n",
@@ -2216,7 +2215,7 @@ static const char *const trb_cl_text[] = {
   "    default: trb_make_form(mesh, 4, prims, first, end, out); break;\n",
   "  }\n",
   "}\n",
-  "#line 2610 \"trbvh.h\"\n",
+  "#line 2611 \"trbvh.h\"\n",
   "#define TRB_UNIT 5.9604645e-8f\n",
   "#define TRB_ABS(x) ((x) < 0 ? -(x) : (x))\n",
   "typedef struct trb_ray {\n",
@@ -2294,7 +2293,7 @@ static const char *const trb_cl_text[] = {
   "  along = TRB_MIN(along, 1);\n",
   "  return TRB_MAX(along, 0);\n",
   "}\n",
-  "#line 2694 \"trbvh.h\"\n",
+  "#line 2695 \"trbvh.h\"\n",
   "TRB_CORE int trb_hit_triangle(const TRB_GLOBAL trbvh_triangle *t, const trb_ray *r, float tmax, trbvh_hit *hit) {\n",
   "  const int x = r->axis[0], y = r->axis[1], z = r->axis[2];\n",
   "  const trb_corner a = trb_see(t->v0[x], t->v0[y], t->v0[z], r);\n",
@@ -2335,7 +2334,7 @@ static const char *const trb_cl_text[] = {
   "  hit->u = hit->v = 0;\n",
   "  hit->prim = hit->instance = TRBVH_NONE;\n",
   "}\n",
-  "#line 2738 \"trbvh.h\"\n",
+  "#line 2739 \"trbvh.h\"\n",
   "TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbvh_triangle *triangles,\n",
   "                       const trb_ray *r, int any, trbvh_hit *hit) {\n",
   "  trbvh_u32 stack_node[TRBVH_MAX_DEPTH], height = 0, node = 0, i;\n",
@@ -3849,9 +3848,9 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "#endif\n",
 };
-#define TRB_CL_CORE_LINES 2330u   /* entries of trb_cl_text for user kernels: types, core, traversal */
-#define TRB_CL_LINES      3727u   /* all entries */
-#define TRB_CL_HASH       "3a88294bb60833fe"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_CORE_LINES 2329u   /* entries of trb_cl_text for user kernels: types, core, traversal */
+#define TRB_CL_LINES      3726u   /* all entries */
+#define TRB_CL_HASH       "5ddbead859f83333"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
@@ -4116,7 +4115,7 @@ enum {
   TRB_CL_KERNEL_COUNT
 };
 
-#define TRB_CL_WIDE       40u            /* levels of a tree that get a launch each on a GPU */
+#define TRB_CL_WIDE       40u            /* levels of a tree that get a launch each on a GPU, unless it is a small one */
 #define TRB_CL_GROUPS_MAX 2048u          /* in a launch whose work-items take one element after the other */
 #ifndef TRB_CL_SMALL                     /* fewer triangles are built in C */
   #define TRB_CL_SMALL 20000u
@@ -4697,6 +4696,7 @@ typedef struct trb_cl_work {
   trb_cl_mem  nodes, refs, keys, sorted, counts, partials, ranges, groups, tasks, lists, marks, places, levels;
   trb_cl_mem  out_nodes, out_prims, out_triangles;
   uint32_t    tiles, blocks, spread;     /* work-groups for ref_max elements: tiles, blocks of C, elements in any order */
+  uint32_t    wide;                      /* levels that get a launch each; one work-group takes all others */
 } trb_cl_work;
 
 static uint32_t trb_cl_spread(const trb_cl *cl, uint32_t n) {
@@ -4716,6 +4716,7 @@ static void trb_cl_make_buffers(trb_cl_work *w) {
   w->blocks = trb_blocks(w->b->ref_max, TRB_BLOCK);
   w->tiles = trb_blocks(w->b->ref_max, cl->cpu ? TRB_BLOCK : TRB_GPU_TILE);
   w->spread = trb_cl_spread(cl, w->b->ref_max);
+  w->wide = w->b->ref_max > TRB_GPU_CHUNK ? TRB_CL_WIDE : 0;
   #define TRB_X(member, bytes) \
     w->member = trb_cl_scratch(cl, TRB_CL_SCRATCH_##member, bytes); \
     w->b->stats.bytes_scratch += bytes;
@@ -4877,11 +4878,11 @@ static void trb_cl_list_levels(trb_cl_work *w, uint32_t gamma) {
   trb_cl *cl = w->cl;
   uint32_t level;
   trb_cl_launch(cl, TRB_CL_TREELETS_first_level, 1, w->state, w->nodes, w->levels, w->lists, gamma);
-  for (level = 0; level < TRB_CL_WIDE; level++) {
+  for (level = 0; level < w->wide; level++) {
     uint32_t groups = TRB_MIN(trb_cl_level_groups(level, roots, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX);
     trb_cl_launch(cl, TRB_CL_TREELETS_list_level, groups, w->nodes, w->levels, w->lists, gamma, level);
   }
-  trb_cl_launch(cl, TRB_CL_TREELETS_list_levels, 1, w->state, w->nodes, w->levels, w->lists, gamma, TRB_CL_WIDE);
+  trb_cl_launch(cl, TRB_CL_TREELETS_list_levels, 1, w->state, w->nodes, w->levels, w->lists, gamma, w->wide);
 }
 
 /* One round on a GPU, over the nodes of gamma to `largest` references. */
@@ -4890,8 +4891,8 @@ static void trb_cl_round(trb_cl_work *w, uint32_t gamma, uint32_t largest) {
   trb_cl *cl = w->cl;
   uint32_t level, begin;
   trb_cl_list_levels(w, gamma);
-  trb_cl_launch(cl, TRB_CL_TREELETS_restructure_levels, 1, w->state, w->nodes, w->levels, w->lists, largest, TRB_CL_WIDE);
-  for (level = TRB_CL_WIDE; level-- > 0;)
+  trb_cl_launch(cl, TRB_CL_TREELETS_restructure_levels, 1, w->state, w->nodes, w->levels, w->lists, largest, w->wide);
+  for (level = w->wide; level-- > 0;)
     for (begin = 0; begin < roots && (level >= 31 || begin >> level == 0); begin += TRB_ROOTS_MAX) {
       uint32_t groups = trb_cl_level_groups(level, TRB_MIN(roots - begin, TRB_ROOTS_MAX), TRB_GPU_LANES);
       trb_cl_launch(cl, TRB_CL_TREELETS_restructure_level, groups, w->state, w->nodes, w->levels, w->lists, largest, level,
@@ -4912,8 +4913,8 @@ static void trb_cl_move_gpu(trb_cl_work *w, uint32_t groups, uint32_t merges) {
   trb_cl_launch(cl, TRB_CL_MOVES_release, groups, w->state, w->nodes, w->keys, w->sorted, w->marks);
   trb_cl_launch(cl, TRB_CL_MOVES_move, groups, w->state, w->nodes, w->refs, w->keys, w->sorted, merges);
   trb_cl_list_levels(w, 2);
-  trb_cl_launch(cl, TRB_CL_MOVES_remake_levels, 1, w->state, w->nodes, w->levels, w->lists, TRB_CL_WIDE);
-  for (level = TRB_CL_WIDE; level-- > 0;)
+  trb_cl_launch(cl, TRB_CL_MOVES_remake_levels, 1, w->state, w->nodes, w->levels, w->lists, w->wide);
+  for (level = w->wide; level-- > 0;)
     trb_cl_launch(cl, TRB_CL_MOVES_remake_level, TRB_MIN(trb_cl_level_groups(level, inner, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX),
                   w->state, w->nodes, w->levels, w->lists, level);
 }
@@ -5039,13 +5040,13 @@ static void trb_cl_count_tree(trb_cl_work *w) {
     return;
   }
   trb_cl_launch(cl, TRB_CL_BUILD_first_inner, 1, w->state, w->nodes, w->levels, w->lists, w->marks);
-  for (level = 0; level < TRB_CL_WIDE; level++)
+  for (level = 0; level < w->wide; level++)
     trb_cl_launch(cl, TRB_CL_BUILD_list_inner, TRB_MIN(trb_cl_level_groups(level, inner, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX),
                   w->state, w->nodes, w->keys, w->sorted, w->levels, w->lists, w->marks, level);
   trb_cl_launch(cl, TRB_CL_BUILD_list_rest, 1, w->state, w->nodes, w->keys, w->sorted, w->levels, w->lists, w->marks,
-                TRB_CL_WIDE);
-  trb_cl_launch(cl, TRB_CL_BUILD_count_rest, 1, w->state, w->nodes, w->refs, w->levels, w->lists, w->places, TRB_CL_WIDE);
-  for (level = TRB_CL_WIDE; level-- > 0;)
+                w->wide);
+  trb_cl_launch(cl, TRB_CL_BUILD_count_rest, 1, w->state, w->nodes, w->refs, w->levels, w->lists, w->places, w->wide);
+  for (level = w->wide; level-- > 0;)
     trb_cl_launch(cl, TRB_CL_BUILD_count_inner, TRB_MIN(trb_cl_level_groups(level, inner, TRB_GPU_GROUP), TRB_CL_GROUPS_MAX),
                   w->state, w->nodes, w->refs, w->levels, w->lists, w->places, level);
   trb_cl_launch(cl, TRB_CL_BUILD_sum_inner, 1, w->state, w->nodes, w->refs, w->levels, w->places);

@@ -28,13 +28,14 @@ static const char usage[] =
   "  --small        meshes of 12 to 1000 triangles, and a batch of many, instead of meshes\n";
 
 // >>rows ----------------------------------------------------------------------------------------------------
-/* trbvh's presets, BEST being the same as HIGH in this version; FAST once more, from boxes, which makes no triangles:
- * the work of Embree's builders, which are last. Those of one level are compared. */
+/* trbvh's presets; FAST once more, from boxes, which makes no triangles: the work of Embree's builders, which are last.
+ * Those of one level are compared. */
 typedef struct builder { const char *name; int level, quality; } builder;
 static const builder builders[] = {
   {"trbvh FAST", 0, TRBVH_QUALITY_FAST},
   {"trbvh MEDIUM", 1, TRBVH_QUALITY_MEDIUM},
   {"trbvh HIGH", 2, TRBVH_QUALITY_HIGH},
+  {"trbvh BEST", 3, TRBVH_QUALITY_BEST},
   {"FAST, boxes", 0, TRBVH_QUALITY_FAST},
 #ifdef EX_EMBREE
   {"Embree LOW", 0, RTC_BUILD_QUALITY_LOW},
@@ -42,19 +43,19 @@ static const builder builders[] = {
   {"Embree HIGH", 2, RTC_BUILD_QUALITY_HIGH},
 #endif
 };
-enum { PRESETS = 3, FROM_BOXES = PRESETS, OURS, BUILDERS = sizeof builders / sizeof *builders, REPS_MAX = 99 };
+enum { PRESETS = 4, FROM_BOXES = PRESETS, OURS, BUILDERS = sizeof builders / sizeof *builders, REPS_MAX = 99 };
 
 /* Columns of a row: times are ms, sizes bytes per triangle. "other" is outside of all stages: starting threads, say. */
-enum { RATE, MS, FRESH, STAGE, OTHER = STAGE + 7, SAH, RESULT, SCRATCH, RATIO, SAH_RATIO, COLUMNS };
+enum { RATE, MS, FRESH, STAGE, OTHER = STAGE + 8, SAH, RESULT, SCRATCH, RATIO, SAH_RATIO, COLUMNS };
 static const char *const titles[COLUMNS] = {
-  "Mtri/s", "ms", "fresh", "split", "morton", "sort", "hierarchy", "treelets", "collapse", "finish", "other", "SAH",
-  "result", "scratch", "/ Embree", "SAH / Embree"
+  "Mtri/s", "ms", "fresh", "split", "morton", "sort", "hierarchy", "treelets", "moves", "collapse", "finish", "other",
+  "SAH", "result", "scratch", "/ Embree", "SAH / Embree"
 };
 static const char csv_header[] =
-  "mesh,triangles,threads,builder,mtri_per_s,ms,fresh_ms,split_ms,morton_ms,sort_ms,hierarchy_ms,treelets_ms,"
+  "mesh,triangles,threads,builder,mtri_per_s,ms,fresh_ms,split_ms,morton_ms,sort_ms,hierarchy_ms,treelets_ms,moves_ms,"
   "collapse_ms,finish_ms,other_ms,sah,result_bytes_per_triangle,scratch_bytes_per_triangle,rate_to_embree,"
-  "sah_to_embree,ns_per_triangle,fresh_ns,split_ns,morton_ns,sort_ns,hierarchy_ns,treelets_ns,collapse_ns,finish_ns,"
-  "other_ns\n";
+  "sah_to_embree,ns_per_triangle,fresh_ns,split_ns,morton_ns,sort_ns,hierarchy_ns,treelets_ns,moves_ns,collapse_ns,"
+  "finish_ns,other_ns\n";
 
 typedef struct row {
   char mesh[40];
@@ -147,7 +148,7 @@ static void build_trbvh(run *r, const trbvh_geometry *geometry, int preset, uint
   r->ms[MS][rep] = ex_now_ms() - start;
   const trbvh_stats *s = &r->stats;
   const double stages[OTHER - STAGE] = {s->ms_split, s->ms_morton, s->ms_sort, s->ms_hierarchy, s->ms_treelets,
-                                        s->ms_collapse, s->ms_finish};
+                                        s->ms_moves, s->ms_collapse, s->ms_finish};
   double other = r->ms[MS][rep];
   for (int i = STAGE; i < OTHER; i++) other -= r->ms[i][rep] = stages[i - STAGE];
   r->ms[OTHER][rep] = other > 0 ? other : 0;
