@@ -18,7 +18,7 @@
 #include "../trbvh_cl.h"
 #include "../examples/common.h"
 
-#define PRESETS      3                 /* BEST is HIGH */
+#define PRESETS      3                 /* BEST is for trees that are made once */
 #define WARM_UPS     2
 #define RUNS         7
 #define PROFILES     3
