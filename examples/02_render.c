@@ -153,12 +153,12 @@ static void measure(preset *presets, int count, const ex_ray_set sets[EX_KINDS],
 static void print_table(const preset *presets, int count, const ex_ray_set sets[EX_KINDS], uint32_t triangles)
 {
   static const char *const labels[] = {
-    "build, ms", "  split", "  morton", "  sort", "  hierarchy", "  treelets", "  collapse", "  finish",
-    "  transfer", "first build, ms", "million triangles/s", "SAH cost", "nodes", "leaves", "references",
+    "build, ms", "  split", "  morton", "  sort", "  hierarchy", "  treelets", "  moves", "  collapse",
+    "  finish", "  transfer", "first build, ms", "million triangles/s", "SAH cost", "nodes", "leaves", "references",
     "depth", "million rays/s: primary", "  ambient occlusion", "  diffuse"
   };
-  enum { TRANSFER = 8, FIRST };        /* rows that only a device fills */
-  static const char decimals[] = "1111111111220000222";
+  enum { TRANSFER = 9, FIRST };        /* rows that only a device fills */
+  static const char decimals[] = "11111111111220000222";
   int on_device = 0;
   printf("%-24s", "");
   for (int i = 0; i < count; i++) {
@@ -177,8 +177,8 @@ static void print_table(const preset *presets, int count, const ex_ray_set sets[
         rate[kind] = (double)sets[kind].count / ex_median(ms, ROUNDS) / 1e3;
       }
       const double values[] = {
-        s->ms_total, s->ms_split, s->ms_morton, s->ms_sort, s->ms_hierarchy, s->ms_treelets, s->ms_collapse,
-        s->ms_finish, s->ms_transfer, presets[i].ms_first, triangles / s->ms_total / 1e3, s->sah_cost,
+        s->ms_total, s->ms_split, s->ms_morton, s->ms_sort, s->ms_hierarchy, s->ms_treelets, s->ms_moves,
+        s->ms_collapse, s->ms_finish, s->ms_transfer, presets[i].ms_first, triangles / s->ms_total / 1e3, s->sah_cost,
         s->node_count, s->leaf_count, s->ref_count, s->max_depth, rate[EX_PRIMARY], rate[EX_AMBIENT],
         rate[EX_DIFFUSE]
       };

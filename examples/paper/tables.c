@@ -591,23 +591,25 @@ static void print_scenes(FILE *out, const tables *t, int table, const char *titl
     fputs("\n", out);
   }
 }
+
+enum { STAGES = 8 };
 static void print_stages(FILE *out, const tables *t)
 {
   fprintf(out, "\n### Stages of trbvh's own builds, ns/triangle, one thread, average\n\n"
-          "| %-*s | split | morton | sort | hierarchy | treelets | collapse | finish |", NAME, "");
-  print_rule(out, NAME, 7, 6);
+          "| %-*s | split | morton | sort | hierarchy | treelets | moves | collapse | finish |", NAME, "");
+  print_rule(out, NAME, STAGES, 6);
   for (int row = 0; row < BUILDERS; row++) {
-    double sums[7] = {0};
+    double sums[STAGES] = {0};
     if (!t->wanted[row] || builders[row].make) continue;
     for (size_t i = 0; i < t->inputs.count; i++) {
       const scene_results *s = &t->scenes[i];
       const trbvh_stats *of = &s->rows[row].stats;
-      const double ms[7] = {of->ms_split, of->ms_morton, of->ms_sort, of->ms_hierarchy, of->ms_treelets,
-                            of->ms_collapse, of->ms_finish};
-      for (int k = 0; k < 7; k++) sums[k] += ms[k] * 1e6 / s->triangles / (double)t->inputs.count;
+      const double ms[STAGES] = {of->ms_split, of->ms_morton, of->ms_sort, of->ms_hierarchy, of->ms_treelets,
+                                 of->ms_moves, of->ms_collapse, of->ms_finish};
+      for (int k = 0; k < STAGES; k++) sums[k] += ms[k] * 1e6 / s->triangles / (double)t->inputs.count;
     }
     fprintf(out, "| %-*s |", NAME, builders[row].name);
-    for (int k = 0; k < 7; k++) print_cell(out, 6, 1, sums[k]);
+    for (int k = 0; k < STAGES; k++) print_cell(out, 6, 1, sums[k]);
     fputs("\n", out);
   }
   if (naive_us > 0) {
@@ -742,8 +744,8 @@ static void write_csv(const tables *t)
 {
   FILE *csv = create("", t->csv_path);
   fputs("scene,triangles,builder,references,leaves,depth,sah,epo,lcv,nodes_per_ray,triangles_per_ray,build_ms,"
-        "build_ms_threads,split_ms,morton_ms,sort_ms,hierarchy_ms,treelets_ms,collapse_ms,finish_ms,primary_mrays,"
-        "ambient_mrays,diffuse_mrays,primary_mrays_threads,ambient_mrays_threads,diffuse_mrays_threads", csv);
+        "build_ms_threads,split_ms,morton_ms,sort_ms,hierarchy_ms,treelets_ms,moves_ms,collapse_ms,finish_ms,"
+        "primary_mrays,ambient_mrays,diffuse_mrays,primary_mrays_threads,ambient_mrays_threads,diffuse_mrays_threads", csv);
   for (int k = 5; k <= 9; k++) fprintf(csv, ",effective_mrays_1e%d", k);
   fputs("\n", csv);
   for (size_t i = 0; i < t->inputs.count; i++) {
@@ -754,8 +756,8 @@ static void write_csv(const tables *t)
       const double values[] = {
         s->triangles, of->ref_count, of->leaf_count, of->max_depth, of->sah_cost, r->epo, r->visits.lcv,
         r->visits.nodes, r->visits.triangles, r->ms[0], r->ms[1], of->ms_split, of->ms_morton, of->ms_sort,
-        of->ms_hierarchy, of->ms_treelets, of->ms_collapse, of->ms_finish, r->rates[0][0], r->rates[0][1],
-        r->rates[0][2], r->rates[1][0], r->rates[1][1], r->rates[1][2], effective(r, 1e5),
+        of->ms_hierarchy, of->ms_treelets, of->ms_moves, of->ms_collapse, of->ms_finish, r->rates[0][0],
+        r->rates[0][1], r->rates[0][2], r->rates[1][0], r->rates[1][1], r->rates[1][2], effective(r, 1e5),
         effective(r, 1e6), effective(r, 1e7), effective(r, 1e8), effective(r, 1e9)
       };
       if (!r->made) continue;
