@@ -4108,15 +4108,15 @@ static void trb_start_phase(trb_build *b, uint32_t phase) {
   b->phase.unsplits = b->splitting ? (uint32_t)b->options.unsplit_passes : 0;
 }
 
-/* Does one more tree say whether splits are kept? Not where all are to be, as in the paper. */
+/* Makes a tree from the mesh, up to its last phase; tells what it costs, if that is not NULL. */
+typedef trbvh_result trb_attempt(void *worker, int splitting, double *cost);
+
+/* Are splits to be kept only if they pay? Not where all of them are, as in the paper. */
 static int trb_compares(const trb_build *b) {
   return b->split_max && b->options.unsplit_passes && trb_phases(b) > 1;
 }
 
-/* Makes a tree from the mesh, up to its last phase; tells what it costs, if that is not NULL. */
-typedef trbvh_result trb_attempt(void *worker, int splitting, double *cost);
-
-/* The one without splits is made again where it turns out to be the better one: that takes less memory, and no longer on
+/* The tree with or without splits, whichever is better. The one without splits is made again where it turns out to be the better one: that takes less memory, and no longer on
  * the whole, than making it last. */
 static trbvh_result trb_attempt_both(trb_build *b, trb_attempt *attempt, void *worker) {
   double without, with;
@@ -4130,7 +4130,7 @@ static trbvh_result trb_attempt_both(trb_build *b, trb_attempt *attempt, void *w
 }
 
 static trbvh_result trb_run_phase(trb_build *b, uint32_t phase) {
-  const float share = 0.65f / (float)trb_phases(b), part = b->phase.last ? share : share * b->effort;
+  const float share = 0.65f / (float)trb_phases(b), part = phase + 1 == trb_phases(b) ? share : share * b->effort;
   trbvh_result result = TRBVH_OK;
   trb_start_phase(b, phase);
   b->moves_share = part * 0.25f / (float)((b->phase.unsplits + 1) * TRB_MOVE_BATCHES + 6);

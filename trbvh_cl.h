@@ -4674,7 +4674,7 @@ static trb_cl_mem trb_cl_input(trb_cl *cl, const void *host, size_t size) {
 /* Buffers are shared by what comes one after the other; R is b->ref_max:
  *
  *     nodes  64 R   references before splitting; build nodes
- *     refs   32 R   references, with gaps
+ *     refs   32 R   references, with gaps; or what the leaves hold of a tree that is optimized
  *     keys    8 R   priorities; keys; words for treelets (CPU) and the collapse
  *     sorted  8 R   what splitting found; keys; GPU: what splits wait for; more such words
  *     counts        of tiles; of digits; of waiting splits
