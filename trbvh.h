@@ -4116,8 +4116,8 @@ static int trb_compares(const trb_build *b) {
   return b->split_max && b->options.unsplit_passes && trb_phases(b) > 1;
 }
 
-/* The tree with or without splits, whichever is better. The one without splits is made again where it turns out to be the better one: that takes less memory, and no longer on
- * the whole, than making it last. */
+/* The tree with or without splits, whichever is better. The one without is made again where that is it: which takes less
+ * memory, and no longer on the whole, than making it last. */
 static trbvh_result trb_attempt_both(trb_build *b, trb_attempt *attempt, void *worker) {
   double without, with;
   trbvh_result result;
