@@ -4716,7 +4716,7 @@ static void trb_cl_make_buffers(trb_cl_work *w) {
   w->blocks = trb_blocks(w->b->ref_max, TRB_BLOCK);
   w->tiles = trb_blocks(w->b->ref_max, cl->cpu ? TRB_BLOCK : TRB_GPU_TILE);
   w->spread = trb_cl_spread(cl, w->b->ref_max);
-  w->wide = w->b->ref_max > TRB_GPU_CHUNK ? TRB_CL_WIDE : 0;
+  w->wide = w->b->ref_max > 2 * TRB_GPU_GROUP ? TRB_CL_WIDE : 0;
   #define TRB_X(member, bytes) \
     w->member = trb_cl_scratch(cl, TRB_CL_SCRATCH_##member, bytes); \
     w->b->stats.bytes_scratch += bytes;
@@ -5363,6 +5363,17 @@ static void trb_cl_run_resident(trb_cl_work *w, trbvh_cl_tree *tree, trbvh_resul
                              (size_t)w->plan.prims * (4 + (tree->triangles ? sizeof(trbvh_triangle) : 0));
 }
 
+/* What trbvh_cl_build and trbvh_cl_optimize end with. */
+static trbvh_result trb_cl_report(trb_cl_work *w, trbvh_result result, double start, const trbvh_options *options) {
+  trb_build *b = w->b;
+  if (result && !b->stats.message[0]) trb_fail(b, result, trbvh_result_text(result), 0, 0, 0);
+  if (result && w->cl) trb_cl_refuse(w->cl, b->stats.message);
+  b->stats.on_device = result == TRBVH_OK;
+  b->stats.ms_total = trb_ms() - start;
+  if (options && options->stats) *options->stats = b->stats;
+  return result;
+}
+
 TRBVH_API trbvh_result trbvh_cl_build(trbvh_device *device, trbvh_cl_tree *tree, const trbvh_cl_geometry *geometry,
                                       const trbvh_options *options, struct _cl_event **done) {
   trb_build b;
@@ -5389,12 +5400,7 @@ TRBVH_API trbvh_result trbvh_cl_build(trbvh_device *device, trbvh_cl_tree *tree,
     result = trb_cl_result(w->cl, &b.stats);
     if (result) trbvh_cl_free(device, tree);
   }
-  if (result && !b.stats.message[0]) trb_fail(&b, result, trbvh_result_text(result), 0, 0, 0);
-  if (result && device) trb_cl_refuse(w->cl, b.stats.message);
-  b.stats.on_device = result == TRBVH_OK;
-  b.stats.ms_total = trb_ms() - start;
-  if (options && options->stats) *options->stats = b.stats;
-  return result;
+  return trb_cl_report(w, result, start, options);
 }
 
 static uint32_t trb_cl_tree_groups(const trbvh_cl_tree *tree, uint32_t level) {
@@ -5516,12 +5522,7 @@ TRBVH_API trbvh_result trbvh_cl_optimize(trbvh_device *device, trbvh_cl_tree *tr
     b.stats.leaf_count = tree->node_count / 2;
     b.stats.ref_count = tree->ref_count;
   }
-  if (result && !b.stats.message[0]) trb_fail(&b, result, trbvh_result_text(result), 0, 0, 0);
-  if (result && device) trb_cl_refuse(w->cl, b.stats.message);
-  b.stats.on_device = result == TRBVH_OK;
-  b.stats.ms_total = trb_ms() - start;
-  if (options && options->stats) *options->stats = b.stats;
-  return result;
+  return trb_cl_report(w, result, start, options);
 }
 
 static trbvh_result trb_cl_query(trbvh_device *device, int kernel, const trbvh_cl_tree *tree, trb_cl_mem rays, trb_cl_mem out,
