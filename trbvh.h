@@ -430,8 +430,12 @@ static int trb_simd(void) {
 #define TRB_MIN(a, b) ((a) < (b) ? (a) : (b))     /* the second where one is NaN */
 #define TRB_MAX(a, b) ((a) > (b) ? (a) : (b))
 
-/* Added to what boxes are made of, as it makes -0 to 0: boxes then have the same bits in whatever order they are joined. */
-#define TRB_PLUS_ZERO 0.0f
+/* -0 becomes 0: boxes made of such numbers have the same bits in whatever order they are joined. */
+#ifdef TRBVH_OPENCL_C                    /* whose compilers may take x + 0 for x: rusticl's does */
+TRB_CORE float trb_no_sign(float x) { return trb_bits(x) == 0x80000000u ? 0.0f : x; }
+#else
+TRB_CORE float trb_no_sign(float x) { return x + 0.0f; }
+#endif
 
 TRB_CORE float trb_abs(float x) { return x < 0 ? -x : x; }
 TRB_CORE int   trb_finite(float x) { return (trb_bits(x) & 0x7F800000u) != 0x7F800000u; }
@@ -810,8 +814,8 @@ TRB_CORE int trb_clip(const float v[3][3], trbvh_node *box) {
     }
     low -= 0.5f * pad[k];
     high += 0.5f * pad[k];
-    bounds.min[k] = TRB_MAX(low, box->min[k]) + TRB_PLUS_ZERO;
-    bounds.max[k] = TRB_MIN(high, box->max[k]) + TRB_PLUS_ZERO;
+    bounds.min[k] = trb_no_sign(TRB_MAX(low, box->min[k]));
+    bounds.max[k] = trb_no_sign(TRB_MIN(high, box->max[k]));
     if (!(bounds.min[k] <= bounds.max[k])) return 0;
   }
   *box = bounds;
@@ -931,8 +935,8 @@ TRB_SHARED int trb_triangle_box(const float v[3][3], trbvh_node *box) {
   int k, finite = 1;
   for (k = 0; k < 3; k++) {
     float low = TRB_MIN(v[0][k], v[1][k]), high = TRB_MAX(v[0][k], v[1][k]);
-    box->min[k] = TRB_MIN(v[2][k], low) + TRB_PLUS_ZERO;
-    box->max[k] = TRB_MAX(v[2][k], high) + TRB_PLUS_ZERO;
+    box->min[k] = trb_no_sign(TRB_MIN(v[2][k], low));
+    box->max[k] = trb_no_sign(TRB_MAX(v[2][k], high));
     finite &= trb_finite(v[0][k]) & trb_finite(v[1][k]) & trb_finite(v[2][k]);
   }
   box->first = box->count = 0;
@@ -954,7 +958,7 @@ TRB_SHARED int trb_prim_box(const trb_mesh *mesh, trbvh_u32 i, trbvh_node *box, 
   p = (const TRB_GLOBAL char *)mesh->boxes + (size_t)i * mesh->box_stride;
   trb_load_position(box->min, p);
   trb_load_position(box->max, p + 12);
-  for (k = 0; k < 3; k++) { box->min[k] += TRB_PLUS_ZERO; box->max[k] += TRB_PLUS_ZERO; }
+  for (k = 0; k < 3; k++) { box->min[k] = trb_no_sign(box->min[k]); box->max[k] = trb_no_sign(box->max[k]); }
   box->first = box->count = 0;
   return trb_valid_box(*box);
 }
@@ -992,7 +996,7 @@ TRB_CORE int trb_read_box(const trb_mesh *mesh, trbvh_u32 form, trb_row *row, tr
     const TRB_GLOBAL char *p = (const TRB_GLOBAL char *)mesh->boxes + prim * mesh->box_stride;
     trb_load_position(a, p);
     trb_load_position(b, p + 12);
-    #define TRB_AXIS(k) row->min[k][i] = a[k] + TRB_PLUS_ZERO; row->max[k][i] = b[k] + TRB_PLUS_ZERO;
+    #define TRB_AXIS(k) row->min[k][i] = trb_no_sign(a[k]); row->max[k][i] = trb_no_sign(b[k]);
     TRB_AXIS(0) TRB_AXIS(1) TRB_AXIS(2)
     #undef TRB_AXIS
     row->check[i] = (a[0] + a[1] + a[2]) + (b[0] + b[1] + b[2]);
@@ -1006,8 +1010,8 @@ TRB_CORE int trb_read_box(const trb_mesh *mesh, trbvh_u32 form, trb_row *row, tr
     trb_load_position(c, trb_position(mesh, v2));
     #define TRB_AXIS(k) { \
       float low = TRB_MIN(a[k], b[k]), high = TRB_MAX(a[k], b[k]); \
-      row->min[k][i] = TRB_MIN(c[k], low) + TRB_PLUS_ZERO; \
-      row->max[k][i] = TRB_MAX(c[k], high) + TRB_PLUS_ZERO; }
+      row->min[k][i] = trb_no_sign(TRB_MIN(c[k], low)); \
+      row->max[k][i] = trb_no_sign(TRB_MAX(c[k], high)); }
     TRB_AXIS(0) TRB_AXIS(1) TRB_AXIS(2)
     #undef TRB_AXIS
     row->check[i] = (a[0] + a[1] + a[2]) + (b[0] + b[1] + b[2]) + (c[0] + c[1] + c[2]);
@@ -2316,7 +2320,7 @@ TRB_CORE trbvh_node trb_unsettle(trbvh_node node, trbvh_u32 number, TRB_GLOBAL t
   held->first = node.first;
   held->count = node.count;
   if (node.count == 0) return node;
-  for (k = 0; k < 3; k++) { node.min[k] += TRB_PLUS_ZERO; node.max[k] += TRB_PLUS_ZERO; }    /* they may be anybody's */
+  for (k = 0; k < 3; k++) { node.min[k] = trb_no_sign(node.min[k]); node.max[k] = trb_no_sign(node.max[k]); }    /* anybody's */
   node.first = number;
   return trb_reference(node, costs);
 }
