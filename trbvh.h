@@ -1789,6 +1789,12 @@ TRB_CORE trbvh_node trb_join(trbvh_node a, trbvh_node b) {
   return a;
 }
 
+/* Makes an inner node anew from its children. */
+TRB_CORE void trb_remake(TRB_GLOBAL trbvh_node *nodes, trbvh_u32 node, trb_costs costs) {
+  const trbvh_u32 pair = nodes[node].first;
+  nodes[node] = trb_parent(nodes[pair], nodes[pair + 1], pair, costs);
+}
+
 // ---- Conflicts ----
 TRB_CORE void trb_touched_pairs(const trb_mover *m, trb_move move, trbvh_u32 pairs[3]) {
   pairs[0] = move.node / 2;
@@ -1865,16 +1871,11 @@ TRB_CORE trbvh_u32 trb_list_above(const trb_mover *m, trbvh_u32 slot, trbvh_u32 
   return count;
 }
 
-TRB_CORE void trb_remake(const trb_mover *m, trbvh_u32 node) {
-  const trbvh_u32 pair = m->nodes[node].first;
-  m->nodes[node] = trb_parent(m->nodes[pair], m->nodes[pair + 1], pair, m->costs);
-}
-
 TRB_CORE void trb_remake_listed(const trb_mover *m, trbvh_u32 begin, trbvh_u32 end) {
   for (; begin < end; begin++) {
     const trbvh_u32 node = m->list[begin];
     m->owners[m->nodes[node].first / 2] = TRBVH_NONE;
-    trb_remake(m, node);
+    trb_remake(m->nodes, node, m->costs);
   }
 }
 
@@ -2164,6 +2165,14 @@ TRB_CORE void trb_merge_refs(const trb_mover *m, TRB_GLOBAL trb_move *move) {
   move->above = parent;
 }
 
+/* A move of either kind, if it is to happen. */
+TRB_CORE void trb_make_move(const trb_mover *m, trbvh_u32 i, trbvh_u32 merges) {
+  TRB_GLOBAL trb_move *move = &m->moves[i];
+  if (!(move->gain > 0)) return;
+  if (merges) trb_merge_refs(m, move);
+  else trb_reinsert(m, move);
+}
+
 // ---- Do splits pay at all? ----
 /* Where nearly all that they save is tests of triangles, they cost time: nodes are more, and further apart in memory. So
  * a tree with splits is kept only where it is better by TRB_SPLITS_PAY than the one without, both before their last
@@ -2191,6 +2200,9 @@ TRB_CORE trb_u64 trb_pair_cost(const TRB_GLOBAL trbvh_node *nodes, trbvh_u32 pai
 }
 
 // >>collapse ---- subtrees that are cheaper as leaves become leaves, and the tree moves into its final layout --------
+/* The part of prims[] and triangles[] that a leaf holds. */
+typedef struct trb_held { trbvh_u32 first, count; } trb_held;
+
 /* Every small node knows already whether it is better as a leaf (equation 2, trb_parent); the topmost such nodes
  * become leaves. The result has parents before children and right before left: a pair of siblings, all that is below
  * the right one, all that is below the left one; and so have their primitives.
@@ -2204,8 +2216,6 @@ TRB_CORE trb_u64 trb_pair_cost(const TRB_GLOBAL trbvh_node *nodes, trbvh_u32 pai
  * The depth bound: a node at depth d with n references can always be made a balanced subtree that ends at depth
  * d + ceil(log2 n). Where a child could no longer be made so within TRBVH_MAX_DEPTH, its parent still can, and is. As
  * this holds at the root, it holds everywhere. */
-typedef struct trb_held { trbvh_u32 first, count; } trb_held;
-
 typedef struct trb_collapser {
   TRB_GLOBAL trbvh_node *nodes;
   trb_words words;
@@ -3163,7 +3173,7 @@ typedef struct trb_build {
   double                sah;             /* equation 1's sum above the tasks */
   struct { uint32_t last, unsplits, gamma, rounds; } phase;
   uint32_t              slot_count;      /* of refs, gaps among them */
-  uint32_t              lowest_score, move_count, batch;
+  uint32_t              lowest_score, move_count, batch, merges;
   float                 moves_share;     /* of the call's time: one batch of moves */
   /* parameters of the jobs at work */
   float                 priority_unit;
@@ -3825,27 +3835,19 @@ static void trb_search_job(void *context, uint32_t index) {
   for (; i < end; i++) trb_search(&m, i, b->batch, trb_least_gain(b->lowest_score));
 }
 
-static void trb_reinsert_job(void *context, uint32_t index) {
+static void trb_move_job(void *context, uint32_t index) {
   const trb_build *b = (const trb_build *)context;
   const trb_mover m = trb_build_mover(b);
   uint32_t i = index * TRB_MOVES, end = TRB_MIN(b->move_count, i + TRB_MOVES);
-  for (; i < end; i++)
-    if (m.moves[i].gain > 0) trb_reinsert(&m, &m.moves[i]);
+  for (; i < end; i++) trb_make_move(&m, i, b->merges);
 }
 
-static void trb_merge_job(void *context, uint32_t index) {
-  const trb_build *b = (const trb_build *)context;
+/* What a batch has found: merges, or reinsertions. */
+static int trb_make_moves(trb_build *b, uint32_t merges) {
   const trb_mover m = trb_build_mover(b);
-  uint32_t i = index * TRB_MOVES, end = TRB_MIN(b->move_count, i + TRB_MOVES);
-  for (; i < end; i++)
-    if (m.moves[i].gain > 0) trb_merge_refs(&m, &m.moves[i]);
-}
-
-/* What a batch has found. */
-static int trb_make_moves(trb_build *b, trbvh_job *job) {
-  const trb_mover m = trb_build_mover(b);
+  b->merges = merges;
   trb_choose_moves(&m, b->move_count);
-  if (trb_run(&b->runner, trb_blocks(b->move_count, TRB_MOVES), job, b)) return 1;
+  if (trb_run(&b->runner, trb_blocks(b->move_count, TRB_MOVES), trb_move_job, b)) return 1;
   trb_remake_moved(&m, b->move_count);
   return 0;
 }
@@ -3857,7 +3859,7 @@ static int trb_reinsert_candidates(trb_build *b) {
   if (trb_find_candidates(b, wanted)) return 1;
   memset(trb_build_mover(b).owners, 0xFF, (size_t)b->ref_count * sizeof(uint32_t));
   for (b->batch = 0; b->batch <= TRB_MOVE_BATCHES; b->batch++)
-    if (trb_run_moves(b, trb_blocks(b->move_count, TRB_SEARCHES), trb_search_job) || trb_make_moves(b, trb_reinsert_job)) return 1;
+    if (trb_run_moves(b, trb_blocks(b->move_count, TRB_SEARCHES), trb_search_job) || trb_make_moves(b, 0)) return 1;
   return 0;
 }
 
@@ -3917,7 +3919,7 @@ static int trb_unsplit(trb_build *b, uint32_t passes) {
   memset(trb_build_mover(b).owners, 0xFF, (size_t)b->ref_count * sizeof(uint32_t));
   for (pass = 0; pass < passes; pass++)
     for (b->batch = 0; b->batch < TRB_MOVE_BATCHES; b->batch++)
-      if (trb_search_merges(b) || trb_make_moves(b, trb_merge_job)) return 1;
+      if (trb_search_merges(b) || trb_make_moves(b, 1)) return 1;
   return 0;
 }
 
@@ -4223,6 +4225,16 @@ static void trb_hand_over(const trb_build *b, trbvh *bvh, uint32_t prim_count) {
   bvh->flags = b->options.flags;
 }
 
+/* What calls with options end with: a message for every failure, and the user's stats. */
+static trbvh_result trb_report(trb_build *b, trbvh_result result, double start, const trbvh_options *options) {
+  if (result && !b->stats.message[0]) trb_fail(b, result, trbvh_result_text(result), 0, 0, 0);
+  if (options && options->stats) {
+    b->stats.ms_total = trb_ms() - start;
+    *options->stats = b->stats;
+  }
+  return result;
+}
+
 TRBVH_API trbvh_result trbvh_build(trbvh *bvh, const trbvh_geometry *geometry, const trbvh_options *options) {
   trb_build b;
   double start = options && options->stats ? trb_ms() : 0;
@@ -4237,12 +4249,7 @@ TRBVH_API trbvh_result trbvh_build(trbvh *bvh, const trbvh_geometry *geometry, c
   } else if (bvh) {
     trb_hand_over(&b, bvh, b.input.count);
   }
-  if (result && !b.stats.message[0]) trb_fail(&b, result, trbvh_result_text(result), 0, 0, 0);
-  if (options && options->stats) {
-    b.stats.ms_total = trb_ms() - start;
-    *options->stats = b.stats;
-  }
-  return result;
+  return trb_report(&b, result, start, options);
 }
 
 // >>optimize ---- a tree that exists, whose leaves are the references ------------------------------------------------
@@ -4290,7 +4297,7 @@ static trbvh_result trb_open_tree(trb_build *b, const trbvh *bvh) {
   }
   if (!result && count + 1 != pairs)
     return trb_fail(b, TRBVH_BAD_DATA, "%u pairs of nodes, but %u are children", pairs - 1, count, 0);
-  while (count-- && !result) trb_remake(&m, list[count]);
+  while (count-- && !result) trb_remake(b->nodes, list[count], b->costs);
   return result;
 }
 
@@ -4324,10 +4331,7 @@ TRBVH_API trbvh_result trbvh_optimize(trbvh *bvh, const trbvh_options *options) 
     b.stats.leaf_count = bvh->node_count / 2;
     b.stats.ref_count = bvh->ref_count;
   }
-  if (result && !b.stats.message[0]) trb_fail(&b, result, trbvh_result_text(result), 0, 0, 0);
-  b.stats.ms_total = trb_ms() - start;
-  if (options && options->stats) *options->stats = b.stats;
-  return result;
+  return trb_report(&b, result, start, options);
 }
 
 // >>query -----------------------------------------------------------------------------------------------------------
@@ -4393,10 +4397,7 @@ static trbvh_result trb_run_batch(trb_batch batch, const trbvh_options *options)
     if (trb_run(&b.runner, jobs, trb_batch_job, &batch) || trb_stage(&b.runner, 0)) result = TRBVH_CANCELLED;
     trb_runner_stop(&b.runner);
   }
-  if (result && !b.stats.message[0]) trb_fail(&b, result, trbvh_result_text(result), 0, 0, 0);
-  b.stats.ms_total = trb_ms() - start;
-  if (options && options->stats) *options->stats = b.stats;
-  return result;
+  return trb_report(&b, result, start, options);
 }
 
 TRBVH_API trbvh_result trbvh_intersect_n(const trbvh *bvh, const trbvh_ray *rays, trbvh_hit *hits, size_t count,

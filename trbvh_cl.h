@@ -1446,6 +1446,12 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "\n",
   "\n",
+  "TRB_CORE void trb_remake(TRB_GLOBAL trbvh_node *nodes, trbvh_u32 node, trb_costs costs) {\n",
+  "  const trbvh_u32 pair = nodes[node].first;\n",
+  "  nodes[node] = trb_parent(nodes[pair], nodes[pair + 1], pair, costs);\n",
+  "}\n",
+  "\n",
+  "\n",
   "TRB_CORE void trb_touched_pairs(const trb_mover *m, trb_move move, trbvh_u32 pairs[3]) {\n",
   "  pairs[0] = move.node / 2;\n",
   "  pairs[1] = m->parents[move.node / 2] / 2;\n",
@@ -1521,16 +1527,11 @@ static const char *const trb_cl_text[] = {
   "  return count;\n",
   "}\n",
   "\n",
-  "TRB_CORE void trb_remake(const trb_mover *m, trbvh_u32 node) {\n",
-  "  const trbvh_u32 pair = m->nodes[node].first;\n",
-  "  m->nodes[node] = trb_parent(m->nodes[pair], m->nodes[pair + 1], pair, m->costs);\n",
-  "}\n",
-  "\n",
   "TRB_CORE void trb_remake_listed(const trb_mover *m, trbvh_u32 begin, trbvh_u32 end) {\n",
   "  for (; begin < end; begin++) {\n",
   "    const trbvh_u32 node = m->list[begin];\n",
   "    m->owners[m->nodes[node].first / 2] = TRBVH_NONE;\n",
-  "    trb_remake(m, node);\n",
+  "    trb_remake(m->nodes, node, m->costs);\n",
   "  }\n",
   "}\n",
   "\n",
@@ -1555,7 +1556,7 @@ static const char *const trb_cl_text[] = {
   "  }\n",
   "}\n",
   "#endif\n",
-  "#line 1910 \"trbvh.h\"\n",
+  "#line 1911 \"trbvh.h\"\n",
   "#define TRB_MOVE_BATCHES 4u\n",
   "#define TRB_SCORES       2048u\n",
   "#define TRB_SCORE_SHIFT  20\n",
@@ -1594,7 +1595,7 @@ static const char *const trb_cl_text[] = {
   "\n",
   "\n",
   "TRB_CORE float trb_least_gain(trbvh_u32 lowest) { return trb_float(lowest << TRB_SCORE_SHIFT) * 0.0625f; }\n",
-  "#line 1953 \"trbvh.h\"\n",
+  "#line 1954 \"trbvh.h\"\n",
   "TRB_SHARED trb_move trb_find_place(const trb_mover *m, trbvh_u32 node, float least) {\n",
   "  const trbvh_node n = m->nodes[node];\n",
   "  const float area = trb_area(n);\n",
@@ -1707,7 +1708,7 @@ static const char *const trb_cl_text[] = {
   "        m->moves[at++].gain = 0;\n",
   "      }\n",
   "}\n",
-  "#line 2074 \"trbvh.h\"\n",
+  "#line 2075 \"trbvh.h\"\n",
   "#define TRB_UNSPLIT_BIAS 2.0f\n",
   "\n",
   "\n",
@@ -1800,7 +1801,15 @@ static const char *const trb_cl_text[] = {
   "  if (move->target == (move->node ^ 1u)) move->target = parent;\n",
   "  move->above = parent;\n",
   "}\n",
-  "#line 2172 \"trbvh.h\"\n",
+  "\n",
+  "\n",
+  "TRB_CORE void trb_make_move(const trb_mover *m, trbvh_u32 i, trbvh_u32 merges) {\n",
+  "  TRB_GLOBAL trb_move *move = &m->moves[i];\n",
+  "  if (!(move->gain > 0)) return;\n",
+  "  if (merges) trb_merge_refs(m, move);\n",
+  "  else trb_reinsert(m, move);\n",
+  "}\n",
+  "#line 2181 \"trbvh.h\"\n",
   "#define TRB_SPLITS_PAY 0.98\n",
   "\n",
   "\n",
@@ -1821,9 +1830,11 @@ static const char *const trb_cl_text[] = {
   "  if (trb_is_free(left) || trb_is_leaf(parent.count)) return 0;\n",
   "  return (trb_u64)trb_round_cost(unit * trb_area(parent)) + trb_leaf_cost(left, unit, costs) + trb_leaf_cost(right, unit, costs);\n",
   "}\n",
-  "#line 2207 \"trbvh.h\"\n",
-  "typedef struct trb_held { trbvh_u32 first, count; } trb_held;\n",
   "\n",
+  "\n",
+  "\n",
+  "typedef struct trb_held { trbvh_u32 first, count; } trb_held;\n",
+  "#line 2219 \"trbvh.h\"\n",
   "typedef struct trb_collapser {\n",
   "  TRB_GLOBAL trbvh_node *nodes;\n",
   "  trb_words words;\n",
@@ -2044,7 +2055,7 @@ static const char *const trb_cl_text[] = {
   "TRB_CORE void trb_prefetch_pairs(const trb_collapser *c, trbvh_u32 ref, trbvh_u32 count) {\n",
   "  for (; count-- && ref > 2 * TRB_AHEAD; ref--) TRB_PREFETCH(&c->nodes[2 * (ref - 2 * TRB_AHEAD)]);\n",
   "}\n",
-  "#line 2433 \"trbvh.h\"\n",
+  "#line 2443 \"trbvh.h\"\n",
   "TRB_SHARED void trb_settle_task(const trb_collapser *c, TRB_GLOBAL trb_task *task) {\n",
   "  TRB_GLOBAL trbvh_u32 *order = c->words.plane[0] + task->first_ref, *prims = c->words.plane[1] + task->first_ref;\n",
   "  trbvh_u32 waiting = 0, pairs = 0, refs = task->first_ref, prim = 0, max_depth = 0, i;\n",
@@ -2216,7 +2227,7 @@ static const char *const trb_cl_text[] = {
   "    default: trb_make_form(mesh, 4, prims, first, end, out); break;\n",
   "  }\n",
   "}\n",
-  "#line 2615 \"trbvh.h\"\n",
+  "#line 2625 \"trbvh.h\"\n",
   "#define TRB_UNIT 5.9604645e-8f\n",
   "#define TRB_ABS(x) ((x) < 0 ? -(x) : (x))\n",
   "typedef struct trb_ray {\n",
@@ -2294,7 +2305,7 @@ static const char *const trb_cl_text[] = {
   "  along = TRB_MIN(along, 1);\n",
   "  return TRB_MAX(along, 0);\n",
   "}\n",
-  "#line 2699 \"trbvh.h\"\n",
+  "#line 2709 \"trbvh.h\"\n",
   "TRB_CORE int trb_hit_triangle(const TRB_GLOBAL trbvh_triangle *t, const trb_ray *r, float tmax, trbvh_hit *hit) {\n",
   "  const int x = r->axis[0], y = r->axis[1], z = r->axis[2];\n",
   "  const trb_corner a = trb_see(t->v0[x], t->v0[y], t->v0[z], r);\n",
@@ -2335,7 +2346,7 @@ static const char *const trb_cl_text[] = {
   "  hit->u = hit->v = 0;\n",
   "  hit->prim = hit->instance = TRBVH_NONE;\n",
   "}\n",
-  "#line 2743 \"trbvh.h\"\n",
+  "#line 2753 \"trbvh.h\"\n",
   "TRB_CORE int trb_trace(const TRB_GLOBAL trbvh_node *nodes, const TRB_GLOBAL trbvh_triangle *triangles,\n",
   "                       const trb_ray *r, int any, trbvh_hit *hit) {\n",
   "  trbvh_u32 stack_node[TRBVH_MAX_DEPTH], height = 0, node = 0, i;\n",
@@ -3347,12 +3358,6 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "\n",
   "\n",
-  "TRB_CORE void trb_make_move(const trb_mover *m, uint i, uint merges) {\n",
-  "  if (!(m->moves[i].gain > 0)) return;\n",
-  "  if (merges) trb_merge_refs(m, &m->moves[i]);\n",
-  "  else trb_reinsert(m, &m->moves[i]);\n",
-  "}\n",
-  "\n",
   "#ifdef TRB_CPU\n",
   "\n",
   "TRB_KERNEL trb_k_move(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *refs,\n",
@@ -3444,17 +3449,12 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "\n",
   "\n",
-  "static void trb_remake_node(__global trbvh_node *nodes, uint node, trb_costs costs) {\n",
-  "  const uint pair = nodes[node].first;\n",
-  "  nodes[node] = trb_parent(nodes[pair], nodes[pair + 1], pair, costs);\n",
-  "}\n",
-  "\n",
   "TRB_KERNEL trb_k_remake_level(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,\n",
   "                              const __global uint *list, uint level) {\n",
   "  const trb_costs costs = plan->costs;\n",
   "  const uint first = levels[level].first, count = levels[level].count;\n",
   "  uint i;\n",
-  "  TRB_FOR(i, count) trb_remake_node(nodes, list[first + i], costs);\n",
+  "  TRB_FOR(i, count) trb_remake(nodes, list[first + i], costs);\n",
   "}\n",
   "\n",
   "\n",
@@ -3465,7 +3465,7 @@ static const char *const trb_cl_text[] = {
   "  while (lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;\n",
   "  for (lowest++; lowest-- > level;) {\n",
   "    for (i = TRB_LOCAL_ID; i < levels[lowest].count; i += TRB_GROUP)\n",
-  "      trb_remake_node(nodes, list[levels[lowest].first + i], costs);\n",
+  "      trb_remake(nodes, list[levels[lowest].first + i], costs);\n",
   "    TRB_SYNC();\n",
   "  }\n",
   "}\n",
@@ -3808,10 +3808,7 @@ static const char *const trb_cl_text[] = {
   "  const uint first = levels[level].first, count = levels[level].count;\n",
   "  const trb_costs costs = plan->costs;\n",
   "  uint i;\n",
-  "  for (i = (uint)get_global_id(0); i < count; i += (uint)get_global_size(0)) {\n",
-  "    const uint node = list[first + i], pair = nodes[node].first;\n",
-  "    nodes[node] = trb_parent(nodes[pair], nodes[pair + 1], pair, costs);\n",
-  "  }\n",
+  "  for (i = (uint)get_global_id(0); i < count; i += (uint)get_global_size(0)) trb_remake(nodes, list[first + i], costs);\n",
   "}\n",
   "#endif\n",
   "#ifdef TRB_WITH_TRACE\n",
@@ -3849,9 +3846,9 @@ static const char *const trb_cl_text[] = {
   "}\n",
   "#endif\n",
 };
-#define TRB_CL_CORE_LINES 2330u   /* entries of trb_cl_text for user kernels: types, core, traversal */
-#define TRB_CL_LINES      3727u   /* all entries */
-#define TRB_CL_HASH       "2341908ef26e28ec"   /* FNV-1a 64 of all strings: part of the program cache's key */
+#define TRB_CL_CORE_LINES 2341u   /* entries of trb_cl_text for user kernels: types, core, traversal */
+#define TRB_CL_LINES      3724u   /* all entries */
+#define TRB_CL_HASH       "2b0ef3c8d99c7df1"   /* FNV-1a 64 of all strings: part of the program cache's key */
 // >>kernels end -----------------------------------------------------------------------------------------------------
 
 TRBVH_API const char *const *trbvh_cl_source(uint32_t *lines) {
@@ -5366,12 +5363,9 @@ static void trb_cl_run_resident(trb_cl_work *w, trbvh_cl_tree *tree, trbvh_resul
 
 /* What trbvh_cl_build and trbvh_cl_optimize end with. */
 static trbvh_result trb_cl_report(trb_cl_work *w, trbvh_result result, double start, const trbvh_options *options) {
-  trb_build *b = w->b;
-  if (result && !b->stats.message[0]) trb_fail(b, result, trbvh_result_text(result), 0, 0, 0);
-  if (result && w->cl) trb_cl_refuse(w->cl, b->stats.message);
-  b->stats.on_device = result == TRBVH_OK;
-  b->stats.ms_total = trb_ms() - start;
-  if (options && options->stats) *options->stats = b->stats;
+  w->b->stats.on_device = result == TRBVH_OK;
+  result = trb_report(w->b, result, start, options);
+  if (result && w->cl) trb_cl_refuse(w->cl, w->b->stats.message);
   return result;
 }
 

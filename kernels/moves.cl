@@ -170,12 +170,6 @@ TRB_KERNEL trb_k_search_merges(const __global trb_plan *plan, __global trbvh_nod
 }
 
 /* ---- Conflicts, and the moves ---- */
-TRB_CORE void trb_make_move(const trb_mover *m, uint i, uint merges) {
-  if (!(m->moves[i].gain > 0)) return;
-  if (merges) trb_merge_refs(m, &m->moves[i]);
-  else trb_reinsert(m, &m->moves[i]);
-}
-
 #ifdef TRB_CPU
 /* One work-item. merges: splits are taken back. */
 TRB_KERNEL trb_k_move(const __global trb_plan *plan, __global trbvh_node *nodes, __global trbvh_node *refs,
@@ -267,17 +261,12 @@ TRB_KERNEL trb_k_move(const __global trb_plan *plan, __global trbvh_node *nodes,
 }
 
 /* All inner nodes, listed by level: what is the same again gets the same bits. */
-static void trb_remake_node(__global trbvh_node *nodes, uint node, trb_costs costs) {
-  const uint pair = nodes[node].first;
-  nodes[node] = trb_parent(nodes[pair], nodes[pair + 1], pair, costs);
-}
-
 TRB_KERNEL trb_k_remake_level(const __global trb_plan *plan, __global trbvh_node *nodes, const __global trb_level *levels,
                               const __global uint *list, uint level) {
   const trb_costs costs = plan->costs;
   const uint first = levels[level].first, count = levels[level].count;
   uint i;
-  TRB_FOR(i, count) trb_remake_node(nodes, list[first + i], costs);
+  TRB_FOR(i, count) trb_remake(nodes, list[first + i], costs);
 }
 
 /* One work-group: all levels from the lowest one up to `level`. */
@@ -288,7 +277,7 @@ TRB_KERNEL trb_k_remake_levels(const __global trb_plan *plan, __global trbvh_nod
   while (lowest + 1 < TRB_GPU_LEVELS && levels[lowest + 1].count) lowest++;
   for (lowest++; lowest-- > level;) {
     for (i = TRB_LOCAL_ID; i < levels[lowest].count; i += TRB_GROUP)
-      trb_remake_node(nodes, list[levels[lowest].first + i], costs);
+      trb_remake(nodes, list[levels[lowest].first + i], costs);
     TRB_SYNC();
   }
 }

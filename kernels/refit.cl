@@ -79,8 +79,5 @@ TRB_KERNEL trb_k_unsettle_level(const __global trb_plan *plan, __global trbvh_no
   const uint first = levels[level].first, count = levels[level].count;
   const trb_costs costs = plan->costs;
   uint i;
-  for (i = (uint)get_global_id(0); i < count; i += (uint)get_global_size(0)) {
-    const uint node = list[first + i], pair = nodes[node].first;
-    nodes[node] = trb_parent(nodes[pair], nodes[pair + 1], pair, costs);
-  }
+  for (i = (uint)get_global_id(0); i < count; i += (uint)get_global_size(0)) trb_remake(nodes, list[first + i], costs);
 }
